@@ -1,0 +1,1 @@
+"""One robot: the pure estimation core and the shell that runs it."""

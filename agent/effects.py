@@ -1,0 +1,77 @@
+"""What leaves the core. Effects are carried out by a shell, in order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from network.messages import Body
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Send:
+    """A message for one peer; `t_meas_ns` is the instant it speaks of."""
+
+    peer: str
+    t_meas_ns: int
+    body: Body
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Broadcast:
+    """A message for everybody in reach."""
+
+    channel: str
+    t_meas_ns: int
+    body: Body
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackEstimate:
+    """Belief of one target at the estimate's instant: mean (n,), cov (n, n) over a state of `model`."""
+
+    target: str
+    model: str
+    mean: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """Own belief at `t_ns`: mean (n,), cov (n, n) over a state of `model`; ENU, heading CCW from east."""
+
+    t_ns: int
+    model: str
+    mean: Array
+    cov: Array
+    tracks: tuple[TrackEstimate, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Publish:
+    """Something to show outside: the estimate with its tracks."""
+
+    estimate: Estimate
+
+
+@dataclass(frozen=True, slots=True)
+class Persist:
+    """State to be on disk before anything later in the effect list leaves the robot."""
+
+    data: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """Something a person should know, named by `reason`; counted, and logged once per window."""
+
+    reason: str
+    detail: str = ""
+
+
+Effect = Send | Broadcast | Publish | Persist | Alarm

@@ -1,0 +1,1 @@
+"""Estimators: Gaussian algebra, transforms, models, covariance intersection, co-localization."""

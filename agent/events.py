@@ -1,0 +1,91 @@
+"""What enters the core. Every event is frozen and carries `t_ns`, the fleet time at which it was handed in.
+
+Data carry `t_meas_ns` besides: the instant they refer to. Frames: ENU position, heading counter-clockwise
+from east, body FLU. Units SI and radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from network.messages import Message
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """Time has passed; nothing else happened."""
+
+    t_ns: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """Motion over [t0_ns, t_meas_ns], in the body frame at t0: delta = (dx, dy, dz, dyaw), cov (4, 4)."""
+
+    t_ns: int
+    t0_ns: int
+    t_meas_ns: int
+    delta: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fix:
+    """Absolute information: kind `position` (x, y[, z]), `pose` (x, y, heading), `heading`, `altitude`."""
+
+    t_ns: int
+    t_meas_ns: int
+    kind: str
+    z: Array
+    R: Array
+    sensor: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """A relative measurement of a subject: `r2`, `landmark:L3`, `target:t1`, or None (identity unknown).
+
+    kinds `range` (m), `bearing` (rad), `range_bearing` (m, rad); bearings are counter-clockwise from the
+    sensor's forward axis. `mount`: lever arm x, y [m, FLU] and yaw [rad] of the sensor on the body.
+    """
+
+    t_ns: int
+    t_meas_ns: int
+    kind: str
+    of: str | None
+    z: Array
+    R: Array
+    sensor: str = ""
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Received:
+    """A message that passed the endpoint, with the clock offset of its sender as known then.
+
+    offset_ns: peer clock minus own clock; offset_sigma_ns: its standard deviation (None: not measured yet).
+    """
+
+    t_ns: int
+    message: Message
+    offset_ns: int = 0
+    offset_sigma_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LinkChange:
+    """A peer was heard for the first time, came back, fell silent, or began a new life."""
+
+    t_ns: int
+    peer: str
+    up: bool
+    incarnation: int
+    boot_id: int
+
+
+Event = Tick | Odometry | Fix | Observation | Received | LinkChange

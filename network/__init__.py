@@ -1,0 +1,1 @@
+"""Messages between robots: wire format, endpoint, transports, link model, clocks."""

@@ -1,0 +1,195 @@
+"""The messages robots exchange, as plain typed values.
+
+`network.wire` turns them into bytes and back; nothing here knows how an estimate is made. All stamps are
+integer nanoseconds of the *sender's* fleet clock unless a field says otherwise; all arrays are float64.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+SCHEMA = 1
+"""Version of the message layout; it is also part of every key (`cofix/v1/...`)."""
+
+MAX_MESSAGE_BYTES = 1200
+"""One message fits one datagram on a radio with a 1,280-byte MTU."""
+
+MAX_LINES = 4
+"""Unresolved identity lines a snapshot carries at most; an older contact falls back to intersection."""
+
+MAX_STATE_DIM = 8
+MAX_TARGETS = 8
+MAX_MEASUREMENTS = 8
+MAX_ECHOES = 16
+
+
+class Channel:
+    """Names of the channels of a robot's key space."""
+
+    HELLO = "hello"
+    BELIEF = "belief"
+    PAIR = "pair"
+    STATUS = "status"
+    ESTIMATE = "estimate"
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """Who sent a message, in which life, and when.
+
+    `seq` counts per channel and destination, so that the fate of a packet can be computed by its receiver.
+    `t_meas_ns` is the instant the content refers to.
+    """
+
+    source: str
+    boot_id: int
+    incarnation: int
+    seq: int
+    t_meas_ns: int
+    t_send_ns: int
+    schema: int = SCHEMA
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Epoch:
+    """Name of one contact of a pair; later contacts compare greater. The zero epoch means "never met"."""
+
+    t_meas_ns: int = 0
+    initiator: str = ""
+    counter: int = 0
+
+    @property
+    def met(self) -> bool:
+        return self != NEVER
+
+
+NEVER = Epoch()
+
+
+@dataclass(frozen=True, slots=True)
+class ClockEcho:
+    """First half of a four-stamp exchange: `t1_ns` peer's send stamp (its clock), `t2_ns` our receive stamp."""
+
+    peer: str
+    t1_ns: int
+    t2_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """Periodic sign of life (2 Hz) with clock echoes for the neighbours heard."""
+
+    software: str
+    echoes: tuple[ClockEcho, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Belief:
+    """A Gaussian over a state of `model`: mean (n,), covariance (n, n)."""
+
+    model: str
+    mean: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetBelief:
+    """One robot's belief of one target."""
+
+    target: str
+    belief: Belief
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Line:
+    """Accumulated left factors (n, n) of the sender's error since a contact not yet known to be applied."""
+
+    epoch: Epoch
+    matrix: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """A robot at a contact's instant, before the contact's update.
+
+    base   the last contact of the pair the sender applied
+    factor (n, m) sigma for the pair, P_ab = sigma_a sigma_b^T; (n, 0) when never met
+    line   (n, n) left factors accumulated since `base`
+    lines  later contacts the sender opened and does not know the fate of, oldest first
+    known  False when the correlation of the pair has been lost and only intersection is safe
+    """
+
+    belief: Belief
+    base: Epoch
+    factor: Array
+    line: Array
+    lines: tuple[Line, ...] = ()
+    targets: tuple[TargetBelief, ...] = ()
+    known: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurement:
+    """A relative measurement of the receiver by the sender: z (m,), covariance R (m, m).
+
+    `mount` is the sensor's lever arm and turn on the sender's body: x, y [m, FLU], yaw [rad].
+    """
+
+    kind: str
+    z: Array
+    R: Array
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class ReplyStatus(IntEnum):
+    """Answer to a pair request. Everything but OK leaves the requester's estimate untouched."""
+
+    OK = 0
+    TOO_OLD = 1
+    BUSY = 2
+    SUPERSEDED = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairRequest:
+    """Opens a contact: what was measured at `epoch.t_meas_ns`, and the initiator at that instant."""
+
+    epoch: Epoch
+    measurements: tuple[Measurement, ...]
+    snapshot: Snapshot
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairReply:
+    """Answers a contact with the peer's snapshot at the same instant (None unless the status is OK)."""
+
+    epoch: Epoch
+    status: ReplyStatus
+    snapshot: Snapshot | None = None
+
+
+Body = Hello | PairRequest | PairReply
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Message:
+    """A decoded message."""
+
+    header: Header
+    body: Body
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """Bytes on a channel. `destination` is None for a broadcast."""
+
+    source: str
+    channel: str
+    destination: str | None
+    payload: bytes
