@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,13 +59,6 @@ class Publish:
 
 
 @dataclass(frozen=True, slots=True)
-class Persist:
-    """State to be on disk before anything later in the effect list leaves the robot."""
-
-    data: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
 class Alarm:
     """Something a person should know, named by `reason`; counted, and logged once per window."""
 
@@ -74,4 +66,4 @@ class Alarm:
     detail: str = ""
 
 
-Effect = Send | Broadcast | Publish | Persist | Alarm
+Effect = Send | Broadcast | Publish | Alarm

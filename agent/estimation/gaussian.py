@@ -1,0 +1,80 @@
+"""Gaussian algebra shared by every estimator. Arrays are float64; kernels broadcast over leading axes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+TWO_PI = 2.0 * np.pi
+
+
+def wrap(angle: Array) -> Array:
+    """Angles [rad] mapped to (-pi, pi]; any shape."""
+    return np.pi - np.remainder(np.pi - angle, TWO_PI)
+
+
+def wrap_components(vector: Array, angles: tuple[int, ...]) -> Array:
+    """`vector` (..., n) with the components `angles` wrapped; returns the same array, changed in place."""
+    for index in angles:
+        vector[..., index] = wrap(vector[..., index])
+    return vector
+
+
+def symmetrize(matrix: Array) -> Array:
+    """Half the sum of a matrix (..., n, n) and its transpose."""
+    return 0.5 * (matrix + matrix.swapaxes(-1, -2))
+
+
+def is_positive_definite(matrix: Array) -> bool:
+    """Whether one symmetric matrix (n, n) is finite and has a Cholesky factor."""
+    if not np.all(np.isfinite(matrix)):
+        return False
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def square_root(cov: Array) -> Array:
+    """L (..., n, n) with L L^T = cov for a positive semi-definite `cov` (..., n, n).
+
+    Cholesky where it exists; otherwise (exact zeros on the diagonal, for instance noise-free directions) the
+    eigenvector factor. Raises `numpy.linalg.LinAlgError` when `cov` is indefinite beyond rounding: a
+    covariance is never repaired silently.
+    """
+    try:
+        return np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(cov)
+        floor = -1e-9 * np.maximum(np.abs(values).max(axis=-1, keepdims=True), 1e-300)
+        if not np.all(np.isfinite(values)) or np.any(values < floor):
+            raise
+        return np.asarray(vectors * np.sqrt(np.clip(values, 0.0, None))[..., None, :])
+
+
+def quadratic_form(vector: Array, cov: Array) -> Array:
+    """v^T P^-1 v for v (..., n), P (..., n, n): the NEES of an error or the NIS of an innovation."""
+    solved = np.linalg.solve(cov, vector[..., None])
+    return np.asarray((vector[..., None, :] @ solved)[..., 0, 0])
+
+
+def gain(cross: Array, innovation_cov: Array) -> Array:
+    """K = C S^-1 for C (..., n, m), S (..., m, m)."""
+    return np.asarray(np.linalg.solve(innovation_cov, cross.swapaxes(-1, -2)).swapaxes(-1, -2))
+
+
+def clip_canonical_correlations(cov_a: Array, cross: Array, cov_b: Array, limit: float = 0.999) -> Array:
+    """Cross-covariance (n, m) with canonical correlations (singular values of L_a^-1 C L_b^-T) <= `limit`.
+
+    The product rule for third parties (Luft et al. 2018, eq. 28 of UT-CLAT) is an approximation and can leave
+    a joint covariance indefinite; this is the nearest admissible one in the canonical basis.
+    """
+    root_a, root_b = np.linalg.cholesky(cov_a), np.linalg.cholesky(cov_b)
+    white = np.linalg.solve(root_a, np.linalg.solve(root_b, cross.T).T)
+    left, values, right = np.linalg.svd(white, full_matrices=False)
+    if values[0] <= limit:
+        return cross
+    return np.asarray(root_a @ (left * np.minimum(values, limit)) @ right @ root_b.T)

@@ -1,0 +1,80 @@
+"""Covariance intersection: fusion of estimates whose correlation is unknown (Julier & Uhlmann 1997)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.estimation.gaussian import symmetrize, wrap_components
+
+Array = NDArray[np.float64]
+Weight = Literal["trace", "logdet", "fast"]
+
+GRID = np.linspace(0.02, 0.98, 49)
+"""Candidate weights of an intersection; the objective is flat, a finer grid changes nothing measurable."""
+GRID.flags.writeable = False
+
+
+def cost(cov: Array, weight: Weight) -> Array:
+    """What an intersection minimises, for covariances (..., n, n)."""
+    if weight == "logdet":
+        return np.asarray(np.linalg.slogdet(cov)[1])
+    return np.asarray(np.trace(cov, axis1=-2, axis2=-1))
+
+
+def fuse(
+    mean_a: Array, cov_a: Array, mean_b: Array, cov_b: Array, angles: tuple[int, ...], weight: Weight
+) -> tuple[Array, Array, float]:
+    """Intersection of (n,), (n, n) beliefs: P^-1 = w P_a^-1 + (1-w) P_b^-1 (UT-CLAT eq. 29).
+
+    `fast` takes w from the traces (Niehsen 2002); `trace` and `logdet` search a grid including both ends,
+    so the result is never worse than the better belief. Returns (mean, cov, w).
+    """
+    info_a, info_b = np.linalg.inv(cov_a), np.linalg.inv(cov_b)
+    if weight == "fast":
+        trace_a, trace_b = float(np.trace(cov_a)), float(np.trace(cov_b))
+        best = trace_b / (trace_a + trace_b)
+    else:
+        grid = np.concatenate([[0.0], GRID, [1.0]])[:, None, None]
+        best = float(grid[int(np.argmin(cost(np.linalg.inv(grid * info_a + (1.0 - grid) * info_b), weight))), 0, 0])
+    cov = symmetrize(np.linalg.inv(best * info_a + (1.0 - best) * info_b))
+    difference = wrap_components(mean_b - mean_a, angles)
+    mean = mean_a + cov @ ((1.0 - best) * info_b @ difference)
+    return wrap_components(mean, angles), cov, best
+
+
+def best_inflated_update(
+    cov: Array,
+    H_own: Array,
+    own_term: Array,
+    other_term: Array,
+    noise: Array,
+    weight: Weight,
+    now: Array | None = None,
+    cross_now: Array | None = None,
+) -> tuple[Array, Array, Array, float] | None:
+    """Update own belief with a measurement that involves another belief of unknown correlation.
+
+    For w on a grid the prior is cov / w and the other's share of the innovation `other_term` / (1 - w):
+    S(w) = H P H^T / w + other_term / (1 - w) + noise (UT-CLAT eq. 16 with one weight per belief).
+    cov (n, n), H_own (m, n), own_term = H P H^T (m, m), other_term (m, m), noise (m, m) including residuals.
+    For a delayed measurement `now` is the present covariance and `cross_now` its cross-covariance with the
+    error at the instant of the measurement times H^T (n, m). Returns (gain (n, m), cov_new, left (n, n), w),
+    or None when no weight beats leaving the belief alone.
+    """
+    present = cov if now is None else now
+    cross = cov @ H_own.T if cross_now is None else cross_now
+    w = GRID[:, None, None]
+    S = own_term / w + other_term / (1.0 - w) + noise
+    gains = np.linalg.solve(S, np.broadcast_to(cross.T, (len(GRID), *cross.T.shape))).swapaxes(-1, -2) / w
+    covs = present / w - gains @ S @ gains.swapaxes(-1, -2)
+    costs = cost(covs, weight)
+    index = int(np.argmin(costs))
+    if not costs[index] < cost(present, weight):
+        return None
+    best = float(GRID[index])
+    updated = symmetrize(covs[index])
+    left = np.linalg.solve(present / best, updated).T
+    return gains[index], updated, left, best

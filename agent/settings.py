@@ -1,0 +1,99 @@
+"""What the core needs to know, as plain frozen values; `agent.config` reads them from a file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.estimation.intersection import Weight
+from agent.estimation.motion import UNICYCLE, StateLayout, TargetMotion
+from agent.estimation.unscented import DEFAULT, Transform, UnscentedParameters
+
+Array = NDArray[np.float64]
+
+NS = 1_000_000_000
+
+
+def nanoseconds(seconds: float) -> int:
+    """Seconds as integer nanoseconds, rounded to the nearest."""
+    return round(seconds * NS)
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizationSettings:
+    """Cooperative localization by correlation factors (`clat`).
+
+    sighting_weight / fusion_weight   how intersections choose their weight
+    pair_interval_ns                  least time between two contacts of a pair that are used
+    pair_timeout_ns                   a request unanswered for this long is forgotten
+    innovation_cap                    NIS per degree of freedom beyond which S is inflated (0: never)
+    max_lines                         identity lines kept per peer
+    """
+
+    form: Literal["safe", "published"] = "safe"
+    transform: Transform = "unscented"
+    correlation: Literal["factors", "ignored"] = "factors"
+    sighting_weight: Weight = "trace"
+    fusion_weight: Weight = "fast"
+    pair_interval_ns: int = 3 * NS
+    pair_timeout_ns: int = 2 * NS
+    innovation_cap: float = 0.0
+    max_lines: int = 24
+    restart_interval_ns: int = 60 * NS
+    parameters: UnscentedParameters = DEFAULT
+
+
+@dataclass(frozen=True, slots=True)
+class LatenessSettings:
+    """When data are fused and what happens to those that come late.
+
+    settle_ns          an instant is processed once it is this old, so that all its data are in
+    tolerance_ns       stamps this close to a state instant count as that instant
+    horizon_ns         how far the history reaches back
+    odometry_wait_ns   how long data wait for odometry to cover them before the robot coasts to them
+    """
+
+    kind: Literal["compensate", "discard"] = "compensate"
+    settle_ns: int = 0
+    tolerance_ns: int = 1_000_000
+    horizon_ns: int = 5 * NS
+    odometry_wait_ns: int = NS
+
+
+@dataclass(frozen=True, slots=True)
+class CoastSettings:
+    """What the robot may do while its odometry is silent: unknown constant speed and yaw rate (1 sigma)."""
+
+    speed_mps: float = 0.5
+    yaw_rate_radps: float = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetSettings:
+    """A target all robots know of: its model and the common prior at the start."""
+
+    id: str
+    motion: TargetMotion
+    mean: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AgentSettings:
+    """Everything the core is given at its start."""
+
+    robot: str
+    start_ns: int
+    mean: Array
+    cov: Array
+    layout: StateLayout = UNICYCLE
+    targets: tuple[TargetSettings, ...] = ()
+    landmarks: dict[str, tuple[float, float]] = field(default_factory=dict)
+    one_way_sensors: tuple[str, ...] = ()
+    localization: LocalizationSettings = field(default_factory=LocalizationSettings)
+    lateness: LatenessSettings = field(default_factory=LatenessSettings)
+    coast: CoastSettings = field(default_factory=CoastSettings)
+    track: bool = True
