@@ -33,7 +33,9 @@ class Entry:
     after: Array
 
 
-def moved(settings: AgentSettings, state: RobotState, t_ns: int, delta: Array, cov: Array) -> tuple[RobotState, Array]:
+def moved(
+    settings: AgentSettings, state: RobotState, t_ns: int, delta: Array, cov: Array
+) -> tuple[RobotState, Array]:
     """State and targets predicted to `t_ns` with an odometry increment; returns (state, F (n, n))."""
     localization = settings.localization
     own = advance(state.mean, state.cov, delta, cov, localization.transform, localization.parameters)
@@ -45,9 +47,7 @@ def moved(settings: AgentSettings, state: RobotState, t_ns: int, delta: Array, c
             drifted = target.motion.drift(belief.mean, belief.cov, dt_s, localization.transform)
             targets[target.id] = TargetState(drifted.mean, drifted.cov)
     return (
-        replace(
-            state, t_ns=t_ns, mean=own.mean, cov=own.cov, stack=state.stack.left(own.F), targets=targets
-        ),
+        replace(state, t_ns=t_ns, mean=own.mean, cov=own.cov, stack=state.stack.left(own.F), targets=targets),
         own.F,
     )
 
@@ -108,7 +108,9 @@ class History:
         )
         state, _ = moved(self._settings, entry.state, t_ns, first, first_cov)
         localization = self._settings.localization
-        rest = advance(state.mean, state.cov, second, second_cov, localization.transform, localization.parameters)
+        rest = advance(
+            state.mean, state.cov, second, second_cov, localization.transform, localization.parameters
+        )
         return state, self._since(index + 2, following.after @ rest.F)
 
     def _since(self, index: int, psi: Array) -> Array:

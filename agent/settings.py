@@ -54,6 +54,8 @@ class LatenessSettings:
     tolerance_ns       stamps this close to a state instant count as that instant
     horizon_ns         how far the history reaches back
     odometry_wait_ns   how long data wait for odometry to cover them before the robot coasts to them
+    clock_sigma_ns     how well the fleet's clocks agree by themselves (1 sigma); 0: one clock for all.
+                       Measured offsets are blended with this prior.
     """
 
     kind: Literal["compensate", "discard"] = "compensate"
@@ -61,6 +63,7 @@ class LatenessSettings:
     tolerance_ns: int = 1_000_000
     horizon_ns: int = 5 * NS
     odometry_wait_ns: int = NS
+    clock_sigma_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,7 +46,7 @@ def square_root(cov: Array) -> Array:
     covariance is never repaired silently.
     """
     try:
-        return np.linalg.cholesky(cov)
+        return np.asarray(np.linalg.cholesky(cov), dtype=np.float64)
     except np.linalg.LinAlgError:
         values, vectors = np.linalg.eigh(cov)
         floor = -1e-9 * np.maximum(np.abs(values).max(axis=-1, keepdims=True), 1e-300)
@@ -62,7 +62,7 @@ def quadratic_form(vector: Array, cov: Array) -> Array:
 
 
 def gain(cross: Array, innovation_cov: Array) -> Array:
-    """K = C S^-1 for C (..., n, m), S (..., m, m)."""
+    """C S^-1 for C (..., n, m) and symmetric S (..., m, m): a Kalman gain, or P+ P^-1, or an inferred Jacobian."""
     return np.asarray(np.linalg.solve(innovation_cov, cross.swapaxes(-1, -2)).swapaxes(-1, -2))
 
 

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import symmetrize, wrap_components
+from agent.estimation.gaussian import gain, symmetrize, wrap_components
 
 Array = NDArray[np.float64]
 Weight = Literal["trace", "logdet", "fast"]
@@ -38,7 +38,9 @@ def fuse(
         best = trace_b / (trace_a + trace_b)
     else:
         grid = np.concatenate([[0.0], GRID, [1.0]])[:, None, None]
-        best = float(grid[int(np.argmin(cost(np.linalg.inv(grid * info_a + (1.0 - grid) * info_b), weight))), 0, 0])
+        best = float(
+            grid[int(np.argmin(cost(np.linalg.inv(grid * info_a + (1.0 - grid) * info_b), weight))), 0, 0]
+        )
     cov = symmetrize(np.linalg.inv(best * info_a + (1.0 - best) * info_b))
     difference = wrap_components(mean_b - mean_a, angles)
     mean = mean_a + cov @ ((1.0 - best) * info_b @ difference)
@@ -68,7 +70,7 @@ def best_inflated_update(
     cross = cov @ H_own.T if cross_now is None else cross_now
     w = GRID[:, None, None]
     S = own_term / w + other_term / (1.0 - w) + noise
-    gains = np.linalg.solve(S, np.broadcast_to(cross.T, (len(GRID), *cross.T.shape))).swapaxes(-1, -2) / w
+    gains = gain(np.broadcast_to(cross, (len(GRID), *cross.shape)), S) / w
     covs = present / w - gains @ S @ gains.swapaxes(-1, -2)
     costs = cost(covs, weight)
     index = int(np.argmin(costs))
@@ -76,5 +78,5 @@ def best_inflated_update(
         return None
     best = float(GRID[index])
     updated = symmetrize(covs[index])
-    left = np.linalg.solve(present / best, updated).T
+    left = gain(updated, present / best)
     return gains[index], updated, left, best

@@ -29,7 +29,7 @@ class OdometryNoise:
 
     def calibrated(self, delta: Array) -> Array:
         """The increment (dx, dy, dz, dyaw) with the calibrated gains applied."""
-        return delta * np.array([self.scale_along, self.scale_along, 1.0, self.scale_turn])
+        return np.asarray(delta * np.array([self.scale_along, self.scale_along, 1.0, self.scale_turn]))
 
     def covariance(self, delta: Array, dt_s: float) -> Array:
         """(4, 4) covariance of the calibrated increment (dx, dy, dz, dyaw), shape (4,), over `dt_s`."""

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import square_root, symmetrize, wrap_components
+from agent.estimation.gaussian import gain, square_root, symmetrize, wrap_components
 
 Array = NDArray[np.float64]
 Transform = Literal["unscented", "linearized", "jacobian"]
@@ -99,7 +99,7 @@ def propagate(
     deviation -= shift[..., None, :]
     weighted = deviation.swapaxes(-1, -2) * weight_cov
     cross = weighted @ (states - mean[..., None, :])
-    left = np.linalg.solve(cov, cross.swapaxes(-1, -2)).swapaxes(-1, -2)
+    left = gain(cross, cov)
     new_mean = wrap_components(centre[..., 0, :] + shift, angles)
     return Propagated(new_mean, symmetrize(weighted @ deviation), left)
 
@@ -142,7 +142,7 @@ def observe(
     deviation -= shift[..., None, :]
     weighted = deviation.swapaxes(-1, -2) * weight_cov
     cross = (weighted @ (points - mean[..., None, :])).swapaxes(-1, -2)
-    H = np.linalg.solve(cov, cross).swapaxes(-1, -2)
+    H = gain(cross.swapaxes(-1, -2), cov)
     if transform == "linearized":
         return Predicted(centre[..., 0, :], cross, symmetrize(H @ cross), H)
     z = wrap_components(centre[..., 0, :] + shift, angles)

@@ -1,0 +1,156 @@
+"""The pair protocol: one request, one reply, no commit, no lock.
+
+Rules
+-----
+1. The robot that owns a measurement of a peer at instant k initiates. It opens an identity line for the
+   contact's epoch (k, initiator, counter), and sends its snapshot at k with the measurement.
+2. The responder takes its own snapshot at k from its history, answers with it, and updates itself.
+3. The initiator updates itself when the answer comes. If it never comes the transaction is forgotten; the line
+   stays, because the responder may have updated itself.
+4. Either update concerns the own belief only. The cross-covariance after a contact is the same whether one or
+   both applied it, so a lost, late, repeated or reordered message can never make the factors inconsistent.
+5. One contact of a pair is pending at a time. If both measure at once the lower id's contact wins: the lower
+   answers BUSY, the higher gives its own up (and keeps its line).
+6. A contact at or before the last applied one is superseded; a repeated request of the last one is answered
+   with the same reply and not applied again; an instant that has left the history is answered TOO_OLD.
+7. An answer other than OK proves that the responder did not apply the contact: its line is dropped.
+
+Theory: with the innovation nu = H_i e_i + H_j e_j + v and the optimal gain, e_i+ is uncorrelated with nu, hence
+E[e_i+ e_j^T] = E[e_i e_j+^T] = E[e_i+ e_j+^T]. A line Psi maps a robot's error at k to its error now, so
+Cov(e_now, nu) = Psi C, and a contact can be applied late and one-sided, exactly for linear models.
+
+This module decides; it does not estimate. `agent.core` carries the decisions out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from network.messages import Epoch, Measurement, PairReply, PairRequest, ReplyStatus, Snapshot
+
+
+class Step(Enum):
+    """What is to be done about something that happened to a pair."""
+
+    OPEN = "open"
+    SKIP_PENDING = "skip_pending"
+    SKIP_THINNED = "skip_thinned"
+    SKIP_STALE = "skip_stale"
+    APPLY = "apply"
+    APPLY_ABANDON_OWN = "apply_abandon_own"
+    REPEAT_REPLY = "repeat_reply"
+    ANSWER_BUSY = "answer_busy"
+    ANSWER_SUPERSEDED = "answer_superseded"
+    DROP_LINE = "drop_line"
+    IGNORE = "ignore"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pending:
+    """An own request on its way: what was sent, and when to stop waiting for the answer."""
+
+    request: PairRequest
+    deadline_ns: int
+
+    @property
+    def epoch(self) -> Epoch:
+        return self.request.epoch
+
+
+# (own request pending, own id lower than the peer's) -> what a fresh request of the peer leads to
+REQUEST_TABLE: dict[tuple[bool, bool], Step] = {
+    (False, False): Step.APPLY,
+    (False, True): Step.APPLY,
+    (True, False): Step.APPLY_ABANDON_OWN,
+    (True, True): Step.ANSWER_BUSY,
+}
+
+# (it answers the pending request, its status is OK, its epoch is later than the base) -> what a reply leads to
+REPLY_TABLE: dict[tuple[bool, bool, bool], Step] = {
+    (True, True, True): Step.APPLY,
+    (True, True, False): Step.IGNORE,
+    (True, False, True): Step.DROP_LINE,
+    (True, False, False): Step.DROP_LINE,
+    (False, True, True): Step.IGNORE,
+    (False, True, False): Step.IGNORE,
+    (False, False, True): Step.DROP_LINE,
+    (False, False, False): Step.DROP_LINE,
+}
+
+
+class PairExchange:
+    """State of the protocol with one peer: the pending request and the last reply given."""
+
+    def __init__(self, robot: str, peer: str, interval_ns: int, timeout_ns: int) -> None:
+        self._robot, self._peer = robot, peer
+        self._interval_ns, self._timeout_ns = interval_ns, timeout_ns
+        self._counter = 0
+        self._last_reply: PairReply | None = None
+        self.pending: Pending | None = None
+
+    @property
+    def is_low(self) -> bool:
+        """Whether the own id sorts before the peer's."""
+        return self._robot < self._peer
+
+    def measured(self, t_ns: int, base: Epoch) -> Step:
+        """A relative measurement of the peer at `t_ns`, the pair's last applied contact being `base`."""
+        if self.pending is not None:
+            return Step.SKIP_PENDING
+        if base.met and t_ns <= base.t_meas_ns:
+            return Step.SKIP_STALE
+        if base.met and t_ns - base.t_meas_ns < self._interval_ns:
+            return Step.SKIP_THINNED
+        return Step.OPEN
+
+    def open(
+        self, t_ns: int, now_ns: int, measurements: tuple[Measurement, ...], snapshot: Snapshot
+    ) -> PairRequest:
+        """Open a contact; the caller keeps an identity line for the request's epoch and sends the request."""
+        self._counter += 1
+        request = PairRequest(Epoch(t_ns, self._robot, self._counter), measurements, snapshot)
+        self.pending = Pending(request, now_ns + self._timeout_ns)
+        return request
+
+    def requested(self, epoch: Epoch, base: Epoch) -> Step:
+        """The peer opened a contact."""
+        if base.met and epoch <= base:
+            if self._last_reply is not None and self._last_reply.epoch == epoch:
+                return Step.REPEAT_REPLY
+            return Step.ANSWER_SUPERSEDED
+        step = REQUEST_TABLE[self.pending is not None, self.is_low]
+        if step is Step.APPLY_ABANDON_OWN:
+            self.pending = None
+        return step
+
+    def answered(self, reply: PairReply) -> PairReply:
+        """Remember the reply given, for a repeated request."""
+        self._last_reply = reply
+        return reply
+
+    @property
+    def last_reply(self) -> PairReply | None:
+        return self._last_reply
+
+    def replied(self, reply: PairReply, base: Epoch) -> tuple[Step, Pending | None]:
+        """The peer answered; returns the step and the request that is settled by it, if any."""
+        pending = self.pending
+        matches = pending is not None and pending.epoch == reply.epoch
+        ok = reply.status is ReplyStatus.OK and reply.snapshot is not None
+        step = REPLY_TABLE[matches, ok, reply.epoch > base]
+        if matches:
+            self.pending = None
+        return step, pending if matches else None
+
+    def expired(self, now_ns: int) -> bool:
+        """Whether the pending request has just timed out; it is forgotten, its line is not."""
+        if self.pending is None or now_ns < self.pending.deadline_ns:
+            return False
+        self.pending = None
+        return True
+
+    def restarted(self) -> None:
+        """The peer began a new life: nothing of the old one will be answered."""
+        self.pending = None
+        self._last_reply = None

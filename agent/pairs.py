@@ -1,0 +1,345 @@
+"""Pair contacts of one robot: carries out what `agent.pairing` decides, on the robot's state and history."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.belief import Part, RobotState, TargetState
+from agent.effects import Effect, Send
+from agent.estimation.colocalization import (
+    Contact,
+    Options,
+    Update,
+    contact,
+    pair_intersection,
+    pair_update,
+)
+from agent.estimation.gaussian import symmetrize, wrap_components
+from agent.estimation.intersection import fuse
+from agent.estimation.observation import RELATIVE_ANGLES
+from agent.events import LinkChange, Received
+from agent.history import History
+from agent.pairing import PairExchange, Step
+from agent.settings import AgentSettings
+from network.messages import (
+    MAX_LINES,
+    MAX_MEASUREMENTS,
+    MAX_TARGETS,
+    NEVER,
+    Belief,
+    Epoch,
+    Line,
+    Measurement,
+    PairReply,
+    PairRequest,
+    ReplyStatus,
+    Snapshot,
+    TargetBelief,
+)
+
+Array = NDArray[np.float64]
+
+FAR_FUTURE_NS = 2**62
+
+
+class Pairs:
+    """The pair protocol with every peer met, bounded in number by the endpoint."""
+
+    def __init__(self, settings: AgentSettings, options: Options, counters: Counter[str]) -> None:
+        self._settings, self._options, self._counters = settings, options, counters
+        self._exchanges: dict[str, PairExchange] = {}
+        self._lives: dict[str, tuple[int, int]] = {}
+        self._inflated_ns: dict[str, int] = {}
+        self._clock_sigma_ns: dict[str, int] = {}
+        self._motions = {target.id: target.motion for target in settings.targets}
+
+    def exchange(self, peer: str) -> PairExchange:
+        if peer not in self._exchanges:
+            localization = self._settings.localization
+            self._exchanges[peer] = PairExchange(
+                self._settings.robot, peer, localization.pair_interval_ns, localization.pair_timeout_ns
+            )
+        return self._exchanges[peer]
+
+    def deadline_ns(self) -> int:
+        """When the first pending request times out."""
+        return min(
+            (e.pending.deadline_ns for e in self._exchanges.values() if e.pending), default=FAR_FUTURE_NS
+        )
+
+    def expire(self, now_ns: int) -> None:
+        for exchange in self._exchanges.values():
+            if exchange.expired(now_ns):
+                self._counters["pair.timed_out"] += 1
+
+    def snapshot(self, state: RobotState, peer: str) -> Snapshot:
+        """The state as it is told to a peer."""
+        record = state.pair(peer)
+        n = len(state.mean)
+        factor = state.stack.block((Part.FACTOR, peer, NEVER))
+        line = state.stack.block((Part.BASE_LINE, peer, NEVER))
+        lines = []
+        for epoch in record.lines[-MAX_LINES:]:
+            block = state.stack.block((Part.LINE, peer, epoch))
+            assert block is not None
+            lines.append(Line(epoch, block))
+        targets = tuple(
+            TargetBelief(name, Belief(self._motions[name].layout.name, target.mean, target.cov))
+            for name, target in list(state.targets.items())[:MAX_TARGETS]
+        )
+        return Snapshot(
+            Belief(self._settings.layout.name, state.mean, state.cov),
+            record.base,
+            np.zeros((n, 0)) if factor is None else factor,
+            np.eye(n) if line is None else line,
+            tuple(lines),
+            targets,
+            record.known,
+        )
+
+    # -- what happens to a pair -----------------------------------------------------------------------------
+
+    def measured(
+        self,
+        peer: str,
+        t_ns: int,
+        now_ns: int,
+        measurements: tuple[Measurement, ...],
+        state: RobotState,
+        history: History,
+    ) -> tuple[RobotState, PairRequest | None]:
+        """A peer was measured at `t_ns`; returns the state and the request to send, if a contact is opened."""
+        exchange = self.exchange(peer)
+        step = exchange.measured(t_ns, state.pair(peer).base)
+        if step is not Step.OPEN:
+            self._counters[f"pair.{step.value}"] += 1
+            return state, None
+        found = history.at(t_ns)
+        if found is None:
+            self._counters["pair.too_old_own"] += 1
+            return state, None
+        then, psi = found
+        told = tuple(self._with_clock_noise(peer, item) for item in measurements[:MAX_MEASUREMENTS])
+        request = exchange.open(t_ns, now_ns, told, self.snapshot(then, peer))
+        self._counters["pair.started"] += 1
+        state = state.with_line(peer, request.epoch, psi, self._settings.localization.max_lines)
+        history.updated(state)
+        return state, request
+
+    def request(
+        self, event: Received, t_ns: int, state: RobotState, history: History, effects: list[Effect]
+    ) -> RobotState:
+        """The peer opened a contact whose instant is `t_ns` on the own clock."""
+        peer = event.message.header.source
+        request = event.message.body
+        assert isinstance(request, PairRequest)
+        epoch = request.epoch
+        if epoch.initiator != peer or not self._plausible(request):
+            self._counters["pair.malformed"] += 1
+            return state
+        exchange = self.exchange(peer)
+        step = exchange.requested(epoch, state.pair(peer).base)
+        self._counters[f"pair.request_{step.value}"] += 1
+        if step is Step.REPEAT_REPLY and exchange.last_reply is not None:
+            effects.append(Send(peer, epoch.t_meas_ns, exchange.last_reply))
+            return state
+        refusal = {Step.ANSWER_BUSY: ReplyStatus.BUSY, Step.ANSWER_SUPERSEDED: ReplyStatus.SUPERSEDED}.get(
+            step
+        )
+        if refusal is not None:
+            effects.append(Send(peer, epoch.t_meas_ns, PairReply(epoch, refusal)))
+            return state
+        found = history.at(t_ns)
+        if found is None:
+            self._counters["pair.too_old"] += 1
+            effects.append(
+                Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.TOO_OLD)))
+            )
+            return state
+        then, psi = found
+        own = self.snapshot(then, peer)
+        effects.append(Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.OK, own))))
+        state = state.with_line(peer, epoch, psi, self._settings.localization.max_lines)
+        history.updated(state)
+        return self._apply(
+            peer, epoch, request.snapshot, own, request.measurements, False, t_ns, state, history
+        )
+
+    def reply(self, peer: str, reply: PairReply, state: RobotState, history: History) -> RobotState:
+        """The peer answered a contact."""
+        step, pending = self.exchange(peer).replied(reply, state.pair(peer).base)
+        self._counters[f"pair.reply_{step.value}"] += 1
+        if step is Step.DROP_LINE:
+            self._counters[f"pair.answer_{reply.status.name.lower()}"] += 1
+            state = state.without_line(peer, reply.epoch)
+            history.updated(state)
+            return state
+        if step is not Step.APPLY or pending is None or reply.snapshot is None:
+            return state
+        if reply.snapshot.belief.model != self._settings.layout.name:
+            self._counters["pair.malformed"] += 1
+            return state
+        sent = pending.request
+        return self._apply(
+            peer,
+            sent.epoch,
+            sent.snapshot,
+            reply.snapshot,
+            sent.measurements,
+            True,
+            sent.epoch.t_meas_ns,
+            state,
+            history,
+        )
+
+    def link_changed(self, event: LinkChange, state: RobotState, history: History) -> RobotState:
+        """A peer appeared, fell silent or began a new life; a new life restarts the pair.
+
+        Joint covariance <= blk(2 P_a, 2 P_b) whatever the correlation, so both sides double their own and start
+        from P_ab = 0. A peer that restarts again within `restart_interval_ns` is not allowed to inflate us
+        once more: its correlation is taken for unknown instead.
+        """
+        life = (event.incarnation, event.boot_id)
+        before = self._lives.get(event.peer)
+        self._lives[event.peer] = life
+        if before is None or before == life:
+            return state
+        self.exchange(event.peer).restarted()
+        if not state.pair(event.peer).base.met and not state.pair(event.peer).lines:
+            return state
+        self._counters["pair.restarts"] += 1
+        last = self._inflated_ns.get(event.peer)
+        if last is not None and event.t_ns - last < self._settings.localization.restart_interval_ns:
+            state = state.forgotten(event.peer, known=False)
+        else:
+            self._inflated_ns[event.peer] = event.t_ns
+            state = replace(state.forgotten(event.peer, known=True), cov=2.0 * state.cov)
+        history.updated(state)
+        return state
+
+    # -- estimation -----------------------------------------------------------------------------------------
+
+    def _plausible(self, request: PairRequest) -> bool:
+        layout = self._settings.layout
+        return request.snapshot.belief.model == layout.name and all(
+            item.kind in RELATIVE_ANGLES for item in request.measurements
+        )
+
+    def offset_ns(self, event: Received) -> int:
+        """Clock of the message's sender minus the own one: the measured offset blended with the prior.
+
+        A fleet whose clocks are known to agree (`clock_sigma_ns` = 0) needs no measurement.
+        """
+        prior = self._settings.lateness.clock_sigma_ns
+        sigma = event.offset_sigma_ns
+        if prior == 0 or sigma is None:
+            self._clock_sigma_ns[event.message.header.source] = prior
+            return 0
+        share = prior**2 / (prior**2 + sigma**2)
+        self._clock_sigma_ns[event.message.header.source] = round(share**0.5 * sigma)
+        return round(share * event.offset_ns)
+
+    def _with_clock_noise(self, peer: str, item: Measurement) -> Measurement:
+        """R widened by how far the peer may move within the uncertainty of its clock (coasting speed)."""
+        sigma_s = self._clock_sigma_ns.get(peer, self._settings.lateness.clock_sigma_ns) * 1e-9
+        if sigma_s == 0.0:
+            return item
+        moved = (self._settings.coast.speed_mps * sigma_s) ** 2
+        reach = max(float(item.z[0]), 1.0) if item.kind == "range_bearing" else 1.0
+        extra = {"range": [moved], "bearing": [moved / reach**2], "range_bearing": [moved, moved / reach**2]}
+        return replace(item, R=item.R + np.diag(extra[item.kind]))
+
+    def _apply(
+        self,
+        peer: str,
+        epoch: Epoch,
+        initiator: Snapshot,
+        responder: Snapshot,
+        measurements: tuple[Measurement, ...],
+        own_initiated: bool,
+        t_ns: int,
+        state: RobotState,
+        history: History,
+    ) -> RobotState:
+        localization = self._settings.localization
+        correlated = localization.correlation == "factors"
+        own, other = (initiator, responder) if own_initiated else (responder, initiator)
+        own_is_low = self._settings.robot < peer
+        try:
+            found = contact(
+                initiator, responder, own_is_low == own_initiated, measurements, correlated, self._options
+            )
+        except np.linalg.LinAlgError:
+            self._counters["pair.indefinite"] += 1
+            return state
+        psi = state.stack.block((Part.LINE, peer, epoch))
+        if psi is None:
+            self._counters["pair.line_lost"] += 1
+            return state
+        update = self._own_update(found, own, other, own_initiated, psi, state)
+        if update is None:
+            return state
+        state = state.updated(update.mean, update.cov, update.left)
+        if found.cross is None:
+            state = state.forgotten(peer, known=False)
+        elif correlated:
+            after = found.cross_after if own_initiated else found.cross_after.T
+            state = state.with_base(peer, epoch, psi @ after, psi)
+        else:
+            state = state.with_base(peer, epoch, np.zeros((len(psi), len(other.belief.mean))), psi)
+        state = self._fuse_targets(other, t_ns, state, correlated)
+        history.updated(state, update.left)
+        self._counters["pair.applied_initiator" if own_initiated else "pair.applied_responder"] += 1
+        return state
+
+    def _own_update(
+        self,
+        found: Contact,
+        own: Snapshot,
+        other: Snapshot,
+        own_initiated: bool,
+        psi: Array,
+        state: RobotState,
+    ) -> Update | None:
+        layout = self._settings.layout
+        if found.cross is not None:
+            C_own = found.C_i if own_initiated else found.C_j
+            update = pair_update(state.mean, state.cov, layout, psi, C_own, found)
+            if update is None:
+                self._counters["update.not_positive_definite"] += 1
+            return update
+        self._counters["pair.fallback"] += 1
+        H_own, H_other = (found.H_i, found.H_j) if own_initiated else (found.H_j, found.H_i)
+        other_term = H_other @ other.belief.cov @ H_other.T
+        weight = self._settings.localization.sighting_weight
+        return pair_intersection(
+            state.mean, state.cov, layout, psi, H_own, own.belief.cov, other_term, found, weight
+        )
+
+    def _fuse_targets(self, other: Snapshot, t_ns: int, state: RobotState, correlated: bool) -> RobotState:
+        """Intersect the peer's target beliefs, predicted to the state's instant, with the own ones."""
+        localization = self._settings.localization
+        targets = dict(state.targets)
+        for told in other.targets:
+            own = targets.get(told.target)
+            motion = self._motions.get(told.target)
+            if own is None or motion is None or told.belief.model != motion.layout.name:
+                self._counters["target.unknown"] += 1
+                continue
+            mean, cov = told.belief.mean, told.belief.cov
+            if state.t_ns > t_ns:
+                drifted = motion.drift(mean, cov, (state.t_ns - t_ns) * 1e-9, localization.transform)
+                mean, cov = drifted.mean, drifted.cov
+            angles = motion.layout.angles
+            if correlated:
+                mean, cov, _ = fuse(own.mean, own.cov, mean, cov, angles, localization.fusion_weight)
+            else:
+                gain = own.cov @ np.linalg.inv(own.cov + cov)
+                mean = wrap_components(own.mean + gain @ wrap_components(mean - own.mean, angles), angles)
+                cov = symmetrize(own.cov - gain @ own.cov)
+            targets[told.target] = TargetState(mean, cov)
+        return replace(state, targets=targets) if targets else state

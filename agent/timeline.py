@@ -1,0 +1,126 @@
+"""Own inputs in the order of the instants they refer to, and the odometry that connects those instants."""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter, deque
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.estimation.motion import split_increment
+from agent.events import Fix, Observation, Odometry, Received
+from agent.settings import CoastSettings
+
+Array = NDArray[np.float64]
+
+MAX_WAITING = 512
+MAX_INCREMENTS = 4096
+
+
+class Phase(IntEnum):
+    """Order of things that happen at one instant."""
+
+    PREDICT = 0
+    PRIVATE = 1
+    TARGET = 2
+    PAIR = 3
+    BROADCAST = 4
+    PLAN = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Item:
+    """Something to be processed at instant `t_ns` of the own clock."""
+
+    t_ns: int
+    phase: Phase
+    source: str
+    event: Fix | Observation | Received
+
+
+class Timeline:
+    """A bounded heap of items ordered by (instant, phase, source, arrival)."""
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[int, Phase, str, int, Item]] = []
+        self._arrivals = 0
+
+    def __len__(self) -> int:
+        return len(self._heap)
+
+    def push(self, item: Item) -> bool:
+        """Add an item; False when the heap is full."""
+        if len(self._heap) >= MAX_WAITING:
+            return False
+        self._arrivals += 1
+        heapq.heappush(self._heap, (item.t_ns, item.phase, item.source, self._arrivals, item))
+        return True
+
+    def peek(self) -> Item | None:
+        return self._heap[0][4] if self._heap else None
+
+    def pop(self) -> Item:
+        return heapq.heappop(self._heap)[4]
+
+
+class OdometryTrack:
+    """Consecutive odometry increments not used yet. Gaps are coasted over, overlaps are cut."""
+
+    def __init__(self, coast: CoastSettings, tolerance_ns: int, counters: Counter[str]) -> None:
+        self._coast, self._tolerance_ns, self._counters = coast, tolerance_ns, counters
+        self._increments: deque[Odometry] = deque()
+
+    @property
+    def end_ns(self) -> int | None:
+        """Last instant covered by a waiting increment; None when there is none."""
+        return self._increments[-1].t_meas_ns if self._increments else None
+
+    def next_end_ns(self) -> int | None:
+        """End of the first waiting increment."""
+        return self._increments[0].t_meas_ns if self._increments else None
+
+    def add(self, odometry: Odometry, state_ns: int) -> None:
+        """Take an increment; one that ends in the past, or before the previous one, is counted and dropped."""
+        last = self._increments[-1].t_meas_ns if self._increments else state_ns
+        if odometry.t_meas_ns <= last or odometry.t_meas_ns <= odometry.t0_ns:
+            self._counters["odometry.out_of_order"] += 1
+            return
+        if len(self._increments) >= MAX_INCREMENTS:
+            self._counters["odometry.overflow"] += 1
+            self._increments.popleft()
+        self._increments.append(odometry)
+
+    def step(self, state_ns: int, until_ns: int) -> tuple[int, Array, Array]:
+        """The next stretch from `state_ns` towards `until_ns` > state_ns: (its end, delta (4,), cov (4, 4)).
+
+        It ends at the end of an increment, at `until_ns`, or where a gap ends. Without odometry the stretch
+        is a coast: zero motion with the covariance of an unknown constant velocity.
+        """
+        tolerance = self._tolerance_ns
+        while self._increments and self._increments[0].t_meas_ns <= state_ns:
+            self._increments.popleft()
+        if not self._increments or self._increments[0].t0_ns >= until_ns:
+            return self._coasted(state_ns, until_ns)
+        increment = self._increments[0]
+        if increment.t0_ns > state_ns + tolerance:
+            return self._coasted(state_ns, increment.t0_ns)
+        delta, cov = increment.delta, increment.cov
+        start, end = increment.t0_ns, increment.t_meas_ns
+        if start < state_ns - tolerance:
+            _, _, delta, cov = split_increment(delta, cov, (state_ns - start) / (end - start))
+            start = state_ns
+        if end <= until_ns + tolerance:
+            self._increments.popleft()
+            return end, delta, cov
+        delta, cov, rest, rest_cov = split_increment(delta, cov, (until_ns - start) / (end - start))
+        self._increments[0] = Odometry(increment.t_ns, until_ns, end, rest, rest_cov)
+        return until_ns, delta, cov
+
+    def _coasted(self, state_ns: int, until_ns: int) -> tuple[int, Array, Array]:
+        self._counters["odometry.coasted"] += 1
+        dt = (until_ns - state_ns) * 1e-9
+        moved, turned = (self._coast.speed_mps * dt) ** 2, (self._coast.yaw_rate_radps * dt) ** 2
+        return until_ns, np.zeros(4), np.diag([moved, moved, moved, turned])
