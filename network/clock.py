@@ -1,0 +1,85 @@
+"""A peer's clock against our own, from four-stamp exchanges as in NTP (RFC 5905, section 8).
+
+The offset found from one exchange is wrong by at most half its round trip, whatever the asymmetry of the
+link; so the shortest round trip of the last few is the best witness, less so as it ages.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+KEPT_EXCHANGES = 16
+DRIFT_PPM = 50
+"""How fast two crystal clocks may part; an exchange's error grows by this with its age."""
+
+MAX_SPAN_NS = 60 * 10**9
+"""An exchange that took longer says nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Exchange:
+    offset_ns: int
+    round_trip_ns: int
+    t1_ns: int
+
+    def error_ns(self, now_ns: int) -> float:
+        age_ns = max(0, now_ns - self.t1_ns)
+        return self.round_trip_ns / 2 + age_ns * DRIFT_PPM * 1e-6
+
+
+class PeerClock:
+    """Offset (peer's clock minus our own) with its uncertainty."""
+
+    def __init__(self) -> None:
+        self._exchanges: deque[_Exchange] = deque(maxlen=KEPT_EXCHANGES)
+        self._latest_ns = 0
+        self.steps = 0
+        """How often an exchange contradicted all before it, which only a clock that was set can do."""
+
+    def add(self, t1_ns: int, t2_ns: int, t3_ns: int, t4_ns: int) -> bool:
+        """Take one exchange: we sent at t1, the peer received at t2 and sent at t3, we received at t4.
+
+        t1 and t4 are of our clock, t2 and t3 of the peer's. Returns False, and keeps nothing, if they cannot
+        be one exchange: negative stamps or times, or longer than MAX_SPAN_NS.
+        """
+        round_trip_ns = (t4_ns - t1_ns) - (t3_ns - t2_ns)
+        if min(t1_ns, t2_ns) < 0 or t3_ns < t2_ns or round_trip_ns < 0 or t4_ns - t1_ns > MAX_SPAN_NS:
+            return False
+        exchange = _Exchange(((t2_ns - t1_ns) + (t3_ns - t4_ns)) // 2, round_trip_ns, t1_ns)
+        best = self._best(t4_ns)
+        if best is not None:
+            # Both errors are bounds: offsets further apart than their sum are of two different clocks.
+            apart_ns = abs(exchange.offset_ns - best.offset_ns)
+            if apart_ns > exchange.error_ns(t4_ns) + best.error_ns(t4_ns) + 1:
+                self._exchanges.clear()
+                self.steps += 1
+        self._exchanges.append(exchange)
+        self._latest_ns = t4_ns
+        return True
+
+    def _best(self, now_ns: int) -> _Exchange | None:
+        return min(self._exchanges, key=lambda exchange: exchange.error_ns(now_ns), default=None)
+
+    def at(self, now_ns: int) -> tuple[int, int] | None:
+        """(offset, standard deviation) [ns] as known at `now_ns` of our clock; None before an exchange.
+
+        The deviation is that of an error spread evenly over its bound.
+        """
+        best = self._best(now_ns)
+        if best is None:
+            return None
+        return best.offset_ns, math.ceil(best.error_ns(now_ns) / math.sqrt(3))
+
+    @property
+    def offset_ns(self) -> int | None:
+        """Offset at the latest exchange, None before the first."""
+        known = self.at(self._latest_ns)
+        return None if known is None else known[0]
+
+    @property
+    def sigma_ns(self) -> int | None:
+        """Standard deviation of the offset at the latest exchange, None before the first."""
+        known = self.at(self._latest_ns)
+        return None if known is None else known[1]

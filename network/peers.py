@@ -1,0 +1,143 @@
+"""Who is out there: duplicates refused, lives told apart, silence noticed.
+
+A life of a robot is a pair (incarnation, boot id). A new life has a higher incarnation, or the same
+incarnation and a boot id never seen in it. Messages of earlier lives are refused.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+
+from network.clock import PeerClock
+
+WINDOW = 1024
+MAX_PEERS = 64
+MAX_BOOT_IDS = 16
+"""Superseded boot ids remembered per peer; sixteen restarts outlast every message still under way."""
+
+_MASK = (1 << WINDOW) - 1
+
+
+class DuplicateWindow:
+    """Sequence numbers seen of one sender's channel, over the latest `WINDOW` of them."""
+
+    __slots__ = ("_highest", "_seen")
+
+    def __init__(self) -> None:
+        self._highest = -1
+        self._seen = 0
+
+    def refusal(self, seq: int) -> str | None:
+        """Why `seq` is refused, "duplicate" or "too_old_seq", or None; nothing is recorded."""
+        behind = self._highest - seq
+        if behind < 0:
+            return None
+        if behind >= WINDOW:
+            return "too_old_seq"
+        return "duplicate" if self._seen >> behind & 1 else None
+
+    def record(self, seq: int) -> None:
+        """Remember that `seq` was accepted."""
+        ahead = seq - self._highest
+        if ahead <= 0:
+            self._seen |= 1 << -ahead
+        else:
+            self._seen = 1 if ahead >= WINDOW else (self._seen << ahead | 1) & _MASK
+            self._highest = seq
+
+
+class Peer:
+    """One robot heard: its life, when it was last heard, its clock, and what was counted."""
+
+    def __init__(self, robot: str, boot_id: int, incarnation: int) -> None:
+        self.robot = robot
+        self.boot_id = boot_id
+        self.incarnation = incarnation
+        self.up = False
+        self.heard_ns = 0
+        self.sent_ns = 0
+        self.clock = PeerClock()
+        self.counters: Counter[str] = Counter()
+        self._superseded: deque[int] = deque(maxlen=MAX_BOOT_IDS)
+        self._windows: dict[str, DuplicateWindow] = {}
+
+    def is_new_life(self, boot_id: int, incarnation: int) -> bool:
+        """Whether a message of this life begins a new one; meaningful only if it is not of an old life."""
+        return (boot_id, incarnation) != (self.boot_id, self.incarnation)
+
+    def is_old_life(self, boot_id: int, incarnation: int) -> bool:
+        """Whether a message of this life comes from before the present one."""
+        return incarnation < self.incarnation or boot_id in self._superseded
+
+    def refusal(self, boot_id: int, incarnation: int, channel: str, seq: int) -> str | None:
+        """Why a message is refused, or None: "old_life", "duplicate", "too_old_seq". Nothing is recorded."""
+        if self.is_old_life(boot_id, incarnation):
+            return "old_life"
+        window = self._windows.get(channel)
+        if window is None or self.is_new_life(boot_id, incarnation):
+            return None
+        return window.refusal(seq)
+
+    def accept(
+        self, now_ns: int, t_send_ns: int, boot_id: int, incarnation: int, channel: str, seq: int
+    ) -> bool:
+        """Record a message that was not refused; True if the peer came up or began a new life with it."""
+        changed = not self.up
+        if self.is_new_life(boot_id, incarnation):
+            if boot_id != self.boot_id:
+                self._superseded.append(self.boot_id)
+            self.boot_id, self.incarnation = boot_id, incarnation
+            self._windows.clear()
+            self.clock = PeerClock()
+            self.counters["lives"] += 1
+            changed = True
+        self._windows.setdefault(channel, DuplicateWindow()).record(seq)
+        self.up = True
+        self.heard_ns, self.sent_ns = now_ns, t_send_ns
+        self.counters["accepted"] += 1
+        return changed
+
+
+class PeerTable:
+    """At most `MAX_PEERS` peers. Full, it forgets the one silent longest, if silent for `forget_after_ns`."""
+
+    def __init__(self, silent_after_ns: int, forget_after_ns: int) -> None:
+        self.silent_after_ns = silent_after_ns
+        self.forget_after_ns = forget_after_ns
+        self._peers: dict[str, Peer] = {}
+
+    def get(self, robot: str) -> Peer | None:
+        return self._peers.get(robot)
+
+    def admit(self, now_ns: int, robot: str, boot_id: int, incarnation: int) -> Peer | None:
+        """A new entry for a robot not in the table, or None if there is no room."""
+        if len(self._peers) >= MAX_PEERS:
+            oldest = min(self._peers.values(), key=lambda peer: (peer.heard_ns, peer.robot))
+            if oldest.up or now_ns - oldest.heard_ns < self.forget_after_ns:
+                return None
+            del self._peers[oldest.robot]
+        peer = Peer(robot, boot_id, incarnation)
+        self._peers[robot] = peer
+        return peer
+
+    def silence(self, now_ns: int) -> list[Peer]:
+        """The peers that fell silent by now, by id; each is told once."""
+        silent = []
+        for peer in self.sorted():
+            # Our own clock may be set back; the wait then starts over instead of growing by the step.
+            peer.heard_ns = min(peer.heard_ns, now_ns)
+            if peer.up and now_ns - peer.heard_ns >= self.silent_after_ns:
+                peer.up = False
+                # Whatever its clock said may have changed unseen.
+                peer.clock = PeerClock()
+                silent.append(peer)
+        return silent
+
+    def next_silence_ns(self) -> int | None:
+        """When the next peer falls silent if nothing is heard; None if nobody is up."""
+        heard = [peer.heard_ns for peer in self._peers.values() if peer.up]
+        return min(heard) + self.silent_after_ns if heard else None
+
+    def sorted(self) -> list[Peer]:
+        """All peers by id."""
+        return [self._peers[robot] for robot in sorted(self._peers)]

@@ -1,0 +1,408 @@
+"""The wire format: what goes in comes out, byte for byte as written down, and nothing foreign gets through."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from network.messages import (
+    MAX_ECHOES,
+    MAX_LINES,
+    MAX_MESSAGE_BYTES,
+    MAX_TARGETS,
+    NEVER,
+    Belief,
+    Body,
+    ClockEcho,
+    Epoch,
+    Header,
+    Hello,
+    Line,
+    Measurement,
+    Message,
+    PairReply,
+    PairRequest,
+    ReplyStatus,
+    Snapshot,
+    TargetBelief,
+)
+from network.wire import (
+    MAX_INT,
+    MEASUREMENT_DIMS,
+    MODEL_DIMS,
+    REASONS,
+    OversizeError,
+    WireError,
+    decode,
+    encode,
+    peek_header,
+    size_bound,
+)
+
+VECTORS = Path(__file__).parents[1] / "vectors" / "v1.json"
+EYE = np.eye(3)
+HEADER = Header("r1", boot_id=77, incarnation=2, seq=5, t_meas_ns=1_000, t_send_ns=1_200)
+
+
+def example_snapshot() -> Snapshot:
+    return Snapshot(
+        belief=Belief("unicycle", np.array([1.5, -2.0, 0.25]), np.diag([0.25, 0.5, 0.01])),
+        base=Epoch(400, "r2", 3),
+        factor=np.arange(9.0).reshape(3, 3) / 16,
+        line=EYE + 0.125,
+        lines=(Line(Epoch(500, "r1", 4), 0.5 * EYE),),
+        targets=(TargetBelief("t1", Belief("constant_velocity", np.arange(4.0), np.eye(4) * 2)),),
+    )
+
+
+def example_request() -> PairRequest:
+    z, R = np.array([4.5, 0.5]), np.array([[0.04, 0.001], [0.001, 0.0025]])
+    measurement = Measurement("range_bearing", z, R, mount=(0.1, 0.0, 1.5))
+    return PairRequest(Epoch(1_000, "r1", 9), (measurement,), example_snapshot())
+
+
+EXAMPLES: dict[str, Body] = {
+    "hello": Hello("0.1.0", (ClockEcho("r2", 10, 20), ClockEcho("r3", 30, 40))),
+    "pair_request": example_request(),
+    "pair_reply": PairReply(Epoch(1_000, "r2", 9), ReplyStatus.OK, example_snapshot()),
+    "pair_reply_too_old": PairReply(Epoch(1_000, "r2", 9), ReplyStatus.TOO_OLD),
+}
+
+
+def same(a: Any, b: Any) -> bool:
+    """Deep equality of message parts, exact in every number."""
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and a.shape == b.shape and bool(np.all(a == b))
+    if isinstance(a, tuple):
+        return isinstance(b, tuple) and len(a) == len(b) and all(map(same, a, b))
+    if dataclasses.is_dataclass(a):
+        names = [field.name for field in dataclasses.fields(a)]
+        return type(a) is type(b) and all(same(getattr(a, name), getattr(b, name)) for name in names)
+    return type(a) is type(b) and bool(a == b)
+
+
+# --- generators -------------------------------------------------------------------------------------------
+
+stamps = st.integers(0, MAX_INT)
+ids = st.text("abcxyz019-", min_size=1, max_size=24)
+numbers = st.floats(-1e9, 1e9, allow_subnormal=False)
+epochs = st.builds(Epoch, stamps, ids, stamps)
+
+
+def arrays(*shape: int) -> st.SearchStrategy[np.ndarray]:
+    size = int(np.prod(shape))
+    return st.lists(numbers, min_size=size, max_size=size).map(lambda v: np.array(v).reshape(shape))
+
+
+@st.composite
+def covariances(draw: st.DrawFn, n: int) -> np.ndarray:
+    factors = draw(st.lists(st.floats(-1, 1), min_size=n * n, max_size=n * n))
+    root = np.tril(np.array(factors).reshape(n, n), -1) + np.diag(draw(scales(n)))
+    return root @ root.T
+
+
+def scales(n: int) -> st.SearchStrategy[list[float]]:
+    return st.lists(st.floats(1e-2, 1e2), min_size=n, max_size=n)
+
+
+@st.composite
+def beliefs(draw: st.DrawFn) -> Belief:
+    model = draw(st.sampled_from(sorted(MODEL_DIMS)))
+    n = MODEL_DIMS[model]
+    return Belief(model, draw(arrays(n)), draw(covariances(n)))
+
+
+@st.composite
+def measurements(draw: st.DrawFn) -> Measurement:
+    kind = draw(st.sampled_from(sorted(MEASUREMENT_DIMS)))
+    m = MEASUREMENT_DIMS[kind]
+    mount = draw(st.tuples(numbers, numbers, numbers))
+    return Measurement(kind, draw(arrays(m)), draw(covariances(m)), mount)
+
+
+@st.composite
+def snapshots(draw: st.DrawFn) -> Snapshot:
+    belief = draw(beliefs())
+    n = len(belief.mean)
+    line_epochs = sorted(draw(st.lists(epochs, max_size=2, unique=True)))
+    target_ids = draw(st.lists(ids, max_size=2, unique=True))
+    return Snapshot(
+        belief=belief,
+        base=draw(st.one_of(st.just(NEVER), epochs)),
+        factor=draw(arrays(n, draw(st.integers(0, 4)))),
+        line=draw(arrays(n, n)),
+        lines=tuple(Line(epoch, draw(arrays(n, n))) for epoch in line_epochs),
+        targets=tuple(TargetBelief(target, draw(beliefs())) for target in target_ids),
+        known=draw(st.booleans()),
+    )
+
+
+@st.composite
+def messages(draw: st.DrawFn) -> Message:
+    header = Header(draw(ids), *(draw(stamps) for _ in range(5)))
+    kind = draw(st.sampled_from(["hello", "request", "reply"]))
+    body: Body
+    if kind == "hello":
+        peers = sorted(draw(st.lists(ids, max_size=MAX_ECHOES, unique=True)))
+        body = Hello(
+            draw(st.text("0123456789.dev+", max_size=48)),
+            tuple(ClockEcho(peer, draw(stamps), draw(stamps)) for peer in peers),
+        )
+    elif kind == "request":
+        epoch = Epoch(draw(stamps), header.source, draw(stamps))
+        measured = draw(st.lists(measurements(), min_size=1, max_size=2))
+        body = PairRequest(epoch, tuple(measured), draw(snapshots()))
+    else:
+        status = draw(st.sampled_from(ReplyStatus))
+        body = PairReply(draw(epochs), status, draw(snapshots()) if status is ReplyStatus.OK else None)
+    return Message(header, body)
+
+
+# --- what goes in comes out -------------------------------------------------------------------------------
+
+
+@settings(max_examples=120, deadline=None)
+@given(messages())
+def test_every_message_survives_the_wire_exactly(message: Message) -> None:
+    try:
+        payload = encode(message.header, message.body)
+    except OversizeError:
+        assert size_bound(message.body) > MAX_MESSAGE_BYTES
+        return
+    assert same(decode(payload, message.header.source), message)
+    assert peek_header(payload) == message.header
+    assert len(payload) <= size_bound(message.body)
+
+
+@pytest.mark.parametrize("name", sorted(EXAMPLES))
+def test_version_1_is_written_down_byte_for_byte(name: str) -> None:
+    vector = bytes.fromhex(json.loads(VECTORS.read_text())[name])
+    assert encode(HEADER, EXAMPLES[name]) == vector
+    assert same(decode(vector, "r1"), Message(HEADER, EXAMPLES[name]))
+
+
+def test_every_vector_belongs_to_an_example() -> None:
+    assert sorted(json.loads(VECTORS.read_text())) == sorted(EXAMPLES)
+
+
+def test_size_bound_is_tight_within_the_longest_header() -> None:
+    header = Header("a" * 24, MAX_INT, MAX_INT, MAX_INT, MAX_INT, MAX_INT)
+    hello = EXAMPLES["hello"]
+    assert len(encode(header, hello)) == size_bound(hello)
+
+
+# --- our own mistakes raise -------------------------------------------------------------------------------
+
+
+def snapshot_with(**changes: Any) -> PairReply:
+    snapshot = dataclasses.replace(example_snapshot(), **changes)
+    return PairReply(Epoch(1_000, "r2", 9), ReplyStatus.OK, snapshot)
+
+
+def test_too_many_lines_and_targets_for_one_datagram_are_an_oversize_error() -> None:
+    lines = tuple(Line(Epoch(500 + k, "r1", k), EYE) for k in range(MAX_LINES))
+    belief = Belief("constant_velocity", np.zeros(4), np.eye(4))
+    targets = tuple(TargetBelief(f"t{k}", belief) for k in range(MAX_TARGETS))
+    body = snapshot_with(lines=lines, targets=targets)
+    with pytest.raises(OversizeError, match="leave out"):
+        encode(HEADER, body)
+    assert size_bound(body) > MAX_MESSAGE_BYTES
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        snapshot_with(factor=np.zeros((2, 3))),
+        snapshot_with(line=np.full((3, 3), np.nan)),
+        snapshot_with(belief=Belief("unicycle", np.zeros(4), np.eye(4))),
+        snapshot_with(belief=Belief("hovercraft", np.zeros(3), EYE)),
+        snapshot_with(belief=Belief("unicycle", np.zeros(3), -EYE)),
+        snapshot_with(belief=Belief("unicycle", np.zeros(3), np.triu(np.ones((3, 3))) + EYE)),
+        snapshot_with(lines=(Line(Epoch(9, "r1", 2), EYE), Line(Epoch(9, "r1", 1), EYE))),
+        snapshot_with(known=1),
+        PairReply(Epoch(1, "r2", 1), ReplyStatus.OK, None),
+        PairReply(Epoch(1, "r2", 1), ReplyStatus.BUSY, example_snapshot()),
+        PairReply(NEVER, ReplyStatus.BUSY),
+        PairRequest(Epoch(1, "r2", 1), example_request().measurements, example_snapshot()),
+        PairRequest(Epoch(1, "r1", 1), (), example_snapshot()),
+        Hello("spaces and <markup>"),
+        Hello("1", (ClockEcho("r2", 1, 1), ClockEcho("r2", 1, 1))),
+        Hello("1", (ClockEcho("r2", -1, 1),)),
+        "not a body",
+    ],
+)
+def test_a_malformed_own_message_is_a_value_error(body: Any) -> None:
+    with pytest.raises(ValueError):
+        encode(HEADER, body)
+
+
+# --- foreign bytes are refused, each with its reason ------------------------------------------------------
+
+
+def doubles(*values: float) -> bytes:
+    return struct.pack(f"<{len(values)}d", *values)
+
+
+def raw(name: str) -> list[Any]:
+    """The message as nested lists, ready to be spoiled."""
+    unpacked: list[Any] = msgpack.unpackb(encode(HEADER, EXAMPLES[name]))
+    return unpacked
+
+
+def put(name: str, path: tuple[int, ...], value: Any) -> bytes:
+    message = raw(name)
+    at = message
+    for index in path[:-1]:
+        at = at[index]
+    at[path[-1]] = value
+    packed: bytes = msgpack.packb(message)
+    return packed
+
+
+SPOILED = {
+    "a later version": (put("hello", (0, 0), 2), "unknown_version"),
+    "a version that is a boolean": (put("hello", (0, 0), True), "wrong_type"),
+    "a header of six": (put("hello", (0,), [1, "r1", 77, 2, 5, 1_000]), "malformed"),
+    "an empty header": (put("hello", (0,), []), "malformed"),
+    "a header that is a number": (put("hello", (0,), 1), "wrong_type"),
+    "a foreign source": (put("hello", (0, 1), "r2"), "source_mismatch"),
+    "a source with capitals": (put("hello", (0, 1), "R1"), "bad_id"),
+    "a source that is bytes": (put("hello", (0, 1), b"r1"), "wrong_type"),
+    "a boot id that is a boolean": (put("hello", (0, 2), True), "wrong_type"),
+    "a boot id that is a float": (put("hello", (0, 2), 77.0), "wrong_type"),
+    "a negative incarnation": (put("hello", (0, 3), -1), "out_of_range"),
+    "a stamp beyond 63 bits": (put("hello", (0, 6), 2**63), "out_of_range"),
+    "a fourth part": (msgpack.packb([*raw("hello"), 0]), "malformed"),
+    "an unknown body": (put("hello", (1,), 99), "unknown_kind"),
+    "a body kind that is a boolean": (put("hello", (1,), True), "wrong_type"),
+    "a body kind that is text": (put("hello", (1,), "hello"), "wrong_type"),
+    "a body of another kind": (put("hello", (1,), 2), "malformed"),
+    "a body that is a map": (put("hello", (2,), {}), "wrong_type"),
+    "a filled map": (put("hello", (2,), {"a": 1}), "malformed"),
+    "an extension type": (put("hello", (2, 0), msgpack.ExtType(5, b"xx")), "malformed"),
+    "a time stamp extension": (put("hello", (2, 0), msgpack.Timestamp(1)), "malformed"),
+    "no array at all": (msgpack.packb(1), "wrong_type"),
+    "an empty array": (msgpack.packb([]), "malformed"),
+    "bytes after the message": (encode(HEADER, EXAMPLES["hello"]) + b"\x00", "malformed"),
+    "a message cut short": (encode(HEADER, EXAMPLES["hello"])[:-1], "malformed"),
+    "nothing": (b"", "malformed"),
+    "deep nesting": (b"\x91" * MAX_MESSAGE_BYTES, "malformed"),
+    "one byte too many": (b"\x00" * (MAX_MESSAGE_BYTES + 1), "oversize"),
+    "text that is not UTF-8": (msgpack.packb([[1, "r1"], 1]).replace(b"r1", b"\xff\xff"), "malformed"),
+    "unsorted echoes": (put("hello", (2, 1, 0, 0), "r9"), "malformed"),
+    "an echo with a bad id": (put("hello", (2, 1, 0, 0), ""), "bad_id"),
+    "too many echoes": (put("hello", (2, 1), [["r2", 1, 1]] * (MAX_ECHOES + 1)), "malformed"),
+    "markup as software": (put("hello", (2, 0), "<b>"), "bad_id"),
+    "an unknown measurement": (put("pair_request", (2, 1, 0, 0), "smell"), "unknown_kind"),
+    "a wrong dimension of z": (put("pair_request", (2, 1, 0, 1), 1), "malformed"),
+    "z too short": (put("pair_request", (2, 1, 0, 2), doubles(4.5)), "malformed"),
+    "z as text": (put("pair_request", (2, 1, 0, 2), "0123456789abcdef"), "wrong_type"),
+    "z not a number": (put("pair_request", (2, 1, 0, 2), doubles(4.5, float("nan"))), "non_finite"),
+    "z infinite": (put("pair_request", (2, 1, 0, 2), doubles(float("inf"), 0.0)), "non_finite"),
+    "z enormous": (put("pair_request", (2, 1, 0, 2), doubles(1.0001e9, 0.0)), "out_of_range"),
+    "z whose square overflows": (put("pair_request", (2, 1, 0, 2), doubles(1e300, 0.0)), "out_of_range"),
+    "R not positive": (put("pair_request", (2, 1, 0, 3), doubles(1.0, 2.0, 1.0)), "not_positive_definite"),
+    "R below the floor": (put("pair_request", (2, 1, 0, 3), doubles(1.0, 0.0, 9e-11)), "below_sensor_floor"),
+    "R nearly singular": (put("pair_request", (2, 1, 0, 3), doubles(1, 1, 1 + 1e-12)), "below_sensor_floor"),
+    "a mount that is missing": (put("pair_request", (2, 1, 0, 4), None), "wrong_type"),
+    "no measurement": (put("pair_request", (2, 1), []), "malformed"),
+    "too many measurements": (put("pair_request", (2, 1), [0] * 9), "out_of_range"),
+    "an initiator other than the source": (put("pair_request", (2, 0, 1), "r2"), "source_mismatch"),
+    "the epoch of a pair that never met": (put("pair_request", (2, 0), [0, "", 0]), "out_of_range"),
+    "an epoch without initiator": (put("pair_request", (2, 0), [5, "", 0]), "bad_id"),
+    "an unknown model": (put("pair_reply", (2, 2, 0, 0), "hovercraft"), "unknown_model"),
+    "a model with a wrong dimension": (put("pair_reply", (2, 2, 0, 1), 4), "malformed"),
+    "P indefinite": (put("pair_reply", (2, 2, 0, 3), doubles(1, 2, 0, 1, 0, 1)), "not_positive_definite"),
+    "P singular": (put("pair_reply", (2, 2, 0, 3), doubles(1, 0, 0, 1, 0, 0)), "not_positive_definite"),
+    "a factor with too many columns": (put("pair_reply", (2, 2, 2), 9), "out_of_range"),
+    "a factor of other size than said": (put("pair_reply", (2, 2, 2), 2), "malformed"),
+    "a line cut short": (put("pair_reply", (2, 2, 4), doubles(1.0)), "malformed"),
+    "too many lines": (put("pair_reply", (2, 2, 5), [0] * (MAX_LINES + 1)), "out_of_range"),
+    "a bad target id": (put("pair_reply", (2, 2, 6, 0, 0), "T/1"), "bad_id"),
+    "known as a number": (put("pair_reply", (2, 2, 7), 1), "wrong_type"),
+    "an unknown status": (put("pair_reply", (2, 1), 9), "out_of_range"),
+    "a refusal with a snapshot": (put("pair_reply", (2, 1), 1), "malformed"),
+    "a success without a snapshot": (put("pair_reply", (2, 2), None), "malformed"),
+}
+
+
+@pytest.mark.parametrize("case", sorted(SPOILED))
+def test_a_foreign_message_is_refused_for_the_right_reason(case: str) -> None:
+    payload, reason = SPOILED[case]
+    with pytest.raises(WireError) as refused:
+        decode(payload, "r1")
+    assert refused.value.reason == reason
+
+
+def test_every_reason_is_shown_by_an_example() -> None:
+    assert {reason for _, reason in SPOILED.values()} == set(REASONS)
+
+
+def test_target_named_twice_is_refused() -> None:
+    message = raw("pair_reply")
+    message[2][2][6] *= 2
+    with pytest.raises(WireError, match="malformed"):
+        decode(msgpack.packb(message), "r1")
+
+
+def test_a_scalar_variance_obeys_the_floor_too() -> None:
+    message = raw("pair_request")
+    for variance, reason in [(0.0, "not_positive_definite"), (9e-11, "below_sensor_floor")]:
+        message[2][1] = [["range", 1, doubles(4.0), doubles(variance), doubles(0, 0, 0)]]
+        with pytest.raises(WireError, match=reason):
+            decode(msgpack.packb(message), "r1")
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=MAX_MESSAGE_BYTES + 10))
+def test_arbitrary_bytes_raise_only_wire_errors(payload: bytes) -> None:
+    with pytest.raises(WireError) as refused:
+        decode(payload, "r1")
+    assert refused.value.reason in REASONS
+    peek_header(payload)
+
+
+edits_of_bytes = st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255)), max_size=3)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.sampled_from(sorted(EXAMPLES)), edits_of_bytes)
+def test_mutated_messages_raise_only_wire_errors(name: str, edits: list[tuple[int, int]]) -> None:
+    payload = bytearray(encode(HEADER, EXAMPLES[name]))
+    for position, value in edits:
+        payload[position % len(payload)] = value
+    try:
+        message = decode(bytes(payload), "r1")
+    except WireError:
+        return
+    assert same(decode(encode(message.header, message.body), "r1"), message)
+
+
+def test_structures_of_any_shape_raise_only_wire_errors() -> None:
+    leaves = st.one_of(
+        st.none(), st.booleans(), st.integers(-(2**63), 2**64 - 1), st.floats(), st.text(max_size=5), st.binary()
+    )
+    trees = st.recursive(leaves, lambda inner: st.lists(inner, max_size=8), max_leaves=30)
+
+    @settings(max_examples=200, deadline=None)
+    @given(trees, st.integers(0, 4))
+    def check(body: Any, kind: int) -> None:
+        with pytest.raises(WireError):
+            decode(msgpack.packb([[1, "r1", 1, 1, 1, 1, 1], kind, [body, [], []]]), "r1")
+
+    check()
+
+
+def test_the_header_can_be_read_without_the_body() -> None:
+    assert peek_header(put("pair_reply", (2,), None)) == HEADER
+    assert peek_header(put("hello", (0, 0), 2)) is None
+    assert peek_header(b"\x93") is None
