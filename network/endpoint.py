@@ -1,0 +1,295 @@
+"""The pure half of the network: bytes and times in, events and bytes out.
+
+Every shell sends and receives through an endpoint, the virtual engine too, so that all of them refuse the
+same things for the same reasons. It reads no clock, holds no socket, and never raises on what others sent:
+each refusal is counted as `rejected.<reason>`. Reasons besides those of `network.wire`:
+
+    own_echo           our own message came back
+    not_for_us         directed at another robot
+    wrong_channel      a body on a channel where it does not belong
+    from_future        stamped further ahead than `offset_bound_ns`
+    too_old            sent or measured more than `horizon_ns` ago
+    old_life           from before the sender's restart
+    duplicate          accepted already
+    too_old_seq        so far behind that it cannot be told from a duplicate
+    too_many_peers     the peer table is full
+
+`received = delivered + hellos + sum of rejected.*` holds at all times.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+from network.messages import (
+    MAX_ECHOES,
+    MAX_MESSAGE_BYTES,
+    Body,
+    Channel,
+    ClockEcho,
+    Header,
+    Hello,
+    Message,
+    Packet,
+    PairReply,
+    PairRequest,
+)
+from network.peers import Peer, PeerTable
+from network.wire import MAX_INT, OversizeError, WireError, decode, encode, valid_id
+
+MIN_MAX_BYTES = 900
+"""A hello with all its echoes must fit."""
+
+
+@dataclass(frozen=True, slots=True)
+class EndpointSettings:
+    """Periods and limits, in nanoseconds of fleet time unless said otherwise.
+
+    horizon_ns       age limit of a message's stamps
+    offset_bound_ns  how far in the future they may lie
+    max_bytes        limit of one message [bytes]
+    """
+
+    hello_period_ns: int = 500_000_000
+    silent_after_ns: int = 3_000_000_000
+    horizon_ns: int = 5_000_000_000
+    offset_bound_ns: int = 1_000_000_000
+    max_bytes: int = MAX_MESSAGE_BYTES
+
+    def __post_init__(self) -> None:
+        for name in ("hello_period_ns", "silent_after_ns", "horizon_ns", "offset_bound_ns"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} must be positive")
+        if not MIN_MAX_BYTES <= self.max_bytes <= MAX_MESSAGE_BYTES:
+            raise ValueError(f"max_bytes must lie within {MIN_MAX_BYTES} and {MAX_MESSAGE_BYTES}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Delivery:
+    """A message for the layer above. `offset_ns`: sender's clock minus own, 0 until measured (sigma None)."""
+
+    message: Message
+    offset_ns: int = 0
+    offset_sigma_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PeerChange:
+    """A peer was heard for the first time, came back, began a new life (up), or fell silent (not up)."""
+
+    peer: str
+    up: bool
+    incarnation: int
+    boot_id: int
+
+
+@dataclass(frozen=True, slots=True)
+class PeerStatus:
+    """What is known of one peer, for people: `counts` has accepted, rejected, lives, clock_refused."""
+
+    peer: str
+    up: bool
+    incarnation: int
+    boot_id: int
+    heard_ns: int
+    offset_ns: int | None
+    offset_sigma_ns: int | None
+    clock_steps: int
+    counts: dict[str, int]
+
+
+class Endpoint:
+    """One robot's end of all its links, for one life of the robot.
+
+    robot        own id; boot_id must differ between starts, incarnation says how often factors were lost
+    software     version told to neighbours
+    Raises ValueError if an argument cannot be put on the wire.
+    """
+
+    def __init__(
+        self, *, robot: str, boot_id: int, incarnation: int, settings: EndpointSettings, software: str
+    ) -> None:
+        if not valid_id(robot):
+            raise ValueError("robot must match [a-z0-9-]{1,24}")
+        for name, value in (("boot_id", boot_id), ("incarnation", incarnation)):
+            if not 0 <= value <= MAX_INT:
+                raise ValueError(f"{name} must lie within 0 and 2**63 - 1")
+        self.robot = robot
+        self.boot_id = boot_id
+        self.incarnation = incarnation
+        self.settings = settings
+        self.software = software
+        self.counters: Counter[str] = Counter()
+        self._table = PeerTable(settings.silent_after_ns, settings.horizon_ns + settings.silent_after_ns)
+        self._next_seq: dict[tuple[str, str | None], int] = {}
+        self._hello_due_ns: int | None = None
+        self._echo_turn = 0
+        encode(self._header(0, 0, 0), Hello(software))
+
+    # --- out ----------------------------------------------------------------------------------------------
+
+    def send(self, now_ns: int, peer: str, t_meas_ns: int, body: Body) -> Packet:
+        """A directed message. Raises OversizeError or ValueError (see `network.wire.encode`)."""
+        if not valid_id(peer) or peer == self.robot:
+            raise ValueError("peer must be the id of another robot")
+        return self._packet(now_ns, Channel.PAIR, peer, t_meas_ns, body)
+
+    def broadcast(self, now_ns: int, channel: str, t_meas_ns: int, body: Body) -> Packet:
+        """A message for everybody in reach. Raises OversizeError or ValueError."""
+        if channel == Channel.PAIR:
+            raise ValueError("channel pair is directed: use send")
+        return self._packet(now_ns, channel, None, t_meas_ns, body)
+
+    def _header(self, seq: int, t_meas_ns: int, now_ns: int) -> Header:
+        return Header(self.robot, self.boot_id, self.incarnation, seq, t_meas_ns, now_ns)
+
+    def _packet(self, now_ns: int, channel: str, peer: str | None, t_meas_ns: int, body: Body) -> Packet:
+        if not _belongs(body, channel):
+            raise ValueError(f"{type(body).__name__} does not belong on channel {channel}")
+        seq = self._next_seq.get((channel, peer), 0)
+        payload = encode(self._header(seq, t_meas_ns, now_ns), body)
+        if len(payload) > self.settings.max_bytes:
+            raise OversizeError(f"message takes {len(payload)} of max_bytes = {self.settings.max_bytes}")
+        self._next_seq[(channel, peer)] = seq + 1
+        self.counters["sent"] += 1
+        self.counters["sent_bytes"] += len(payload)
+        return Packet(self.robot, channel, peer, payload)
+
+    def tick(self, now_ns: int) -> tuple[list[Packet], list[PeerChange]]:
+        """The hello if it is due, and the peers that fell silent, by id."""
+        packets = []
+        due_ns, period_ns = self._hello_due_ns, self.settings.hello_period_ns
+        # A due time beyond one period means that our own clock was set back.
+        if due_ns is None or now_ns >= due_ns or due_ns - now_ns > period_ns:
+            packets.append(self.broadcast(now_ns, Channel.HELLO, now_ns, Hello(self.software, self._echoes())))
+            on_time = due_ns is not None and 0 <= now_ns - due_ns < period_ns
+            self._hello_due_ns = period_ns + (due_ns if on_time and due_ns is not None else now_ns)
+        changes = [_change(peer) for peer in self._table.silence(now_ns)]
+        return packets, changes
+
+    def next_deadline_ns(self) -> int:
+        """When `tick` next has something to do, as far as is known now."""
+        if self._hello_due_ns is None:
+            return 0
+        silence_ns = self._table.next_silence_ns()
+        return self._hello_due_ns if silence_ns is None else min(self._hello_due_ns, silence_ns)
+
+    def _echoes(self) -> tuple[ClockEcho, ...]:
+        """Echoes for the neighbours that are up; in turns if there are more than fit."""
+        up = [peer for peer in self._table.sorted() if peer.up]
+        if len(up) > MAX_ECHOES:
+            first = self._echo_turn % len(up)
+            self._echo_turn = first + MAX_ECHOES
+            up = sorted((up + up)[first : first + MAX_ECHOES], key=lambda peer: peer.robot)
+        return tuple(ClockEcho(peer.robot, peer.sent_ns, peer.heard_ns) for peer in up)
+
+    # --- in -----------------------------------------------------------------------------------------------
+
+    def receive(self, now_ns: int, packet: Packet) -> list[Delivery | PeerChange]:
+        """What a packet means to the layer above: nothing, a change of its sender, a message, or both."""
+        self.counters["received"] += 1
+        self.counters["received_bytes"] += len(packet.payload)
+        try:
+            return self._receive(now_ns, packet)
+        except WireError as error:
+            self.counters[f"rejected.{error.reason}"] += 1
+            peer = self._table.get(packet.source)
+            if peer is not None:
+                peer.counters["rejected"] += 1
+            return []
+
+    def _receive(self, now_ns: int, packet: Packet) -> list[Delivery | PeerChange]:
+        message = self._admissible(packet)
+        header, body = message.header, message.body
+        peer = self._table.get(header.source)
+        if peer is not None:
+            refusal = peer.refusal(header.boot_id, header.incarnation, packet.channel, header.seq)
+            if refusal is not None:
+                raise WireError(refusal)
+        self._check_age(now_ns, header, peer)
+        if peer is None:
+            peer = self._table.admit(now_ns, header.source, header.boot_id, header.incarnation)
+            if peer is None:
+                raise WireError("too_many_peers")
+        events: list[Delivery | PeerChange] = []
+        if peer.accept(
+            now_ns, header.t_send_ns, header.boot_id, header.incarnation, packet.channel, header.seq
+        ):
+            events.append(_change(peer))
+        if isinstance(body, Hello):
+            self.counters["hellos"] += 1
+            self._take_echo(now_ns, header, body, peer)
+        else:
+            self.counters["delivered"] += 1
+            known = peer.clock.at(now_ns)
+            events.append(Delivery(message) if known is None else Delivery(message, *known))
+        return events
+
+    def _admissible(self, packet: Packet) -> Message:
+        """The decoded message, if a packet like this may reach us at all."""
+        if packet.source == self.robot:
+            raise WireError("own_echo")
+        if packet.destination is not None and packet.destination != self.robot:
+            raise WireError("not_for_us")
+        if (packet.channel == Channel.PAIR) != (packet.destination is not None):
+            raise WireError("wrong_channel")
+        if len(packet.payload) > self.settings.max_bytes:
+            raise WireError("oversize")
+        message = decode(packet.payload, packet.source)
+        if not _belongs(message.body, packet.channel):
+            raise WireError("wrong_channel")
+        return message
+
+    def _check_age(self, now_ns: int, header: Header, peer: Peer | None) -> None:
+        """Refuse stamps outside [-offset bound, horizon], on the sender's clock as far as it is known."""
+        offset_ns = 0
+        if peer is not None and not peer.is_new_life(header.boot_id, header.incarnation):
+            known = peer.clock.at(now_ns)
+            offset_ns = 0 if known is None else known[0]
+        for stamp_ns in (header.t_send_ns, header.t_meas_ns):
+            age_ns = now_ns - (stamp_ns - offset_ns)
+            if age_ns < -self.settings.offset_bound_ns:
+                raise WireError("from_future")
+            if age_ns > self.settings.horizon_ns:
+                raise WireError("too_old")
+
+    def _take_echo(self, now_ns: int, header: Header, hello: Hello, peer: Peer) -> None:
+        for echo in hello.echoes:
+            if echo.peer == self.robot and not peer.clock.add(
+                echo.t1_ns, echo.t2_ns, header.t_send_ns, now_ns
+            ):
+                self.counters["clock_refused"] += 1
+                peer.counters["clock_refused"] += 1
+
+    # --- for people ---------------------------------------------------------------------------------------
+
+    def peers(self) -> tuple[PeerStatus, ...]:
+        """Everybody ever heard and not forgotten, by id."""
+        return tuple(
+            PeerStatus(
+                peer.robot,
+                peer.up,
+                peer.incarnation,
+                peer.boot_id,
+                peer.heard_ns,
+                peer.clock.offset_ns,
+                peer.clock.sigma_ns,
+                peer.clock.steps,
+                dict(peer.counters),
+            )
+            for peer in self._table.sorted()
+        )
+
+
+def _change(peer: Peer) -> PeerChange:
+    return PeerChange(peer.robot, peer.up, peer.incarnation, peer.boot_id)
+
+
+def _belongs(body: Body, channel: str) -> bool:
+    """Whether a body of this type may travel on this channel."""
+    if isinstance(body, Hello):
+        return channel == Channel.HELLO
+    if isinstance(body, PairRequest | PairReply):
+        return channel == Channel.PAIR
+    return channel == Channel.BELIEF
