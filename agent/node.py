@@ -1,0 +1,126 @@
+"""One robot without its I/O: endpoint, sensor input and core together. Every shell runs exactly this."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from agent.core import Agent
+from agent.effects import Broadcast, Effect, Estimate, Publish, Send
+from agent.events import Event, LinkChange, Received, Tick
+from agent.sensor_input import SensorConfig, SensorError, decode
+from agent.settings import AgentSettings
+from network.endpoint import Delivery, Endpoint, EndpointSettings, PeerChange
+from network.messages import Packet
+from network.wire import OversizeError
+
+Recorder = Callable[[Event, list[Effect]], None]
+
+
+@dataclass(slots=True)
+class Outgoing:
+    """What a shell has to carry out: packets to send and estimates to show."""
+
+    packets: list[Packet] = field(default_factory=list)
+    estimates: list[Estimate] = field(default_factory=list)
+    alarms: list[str] = field(default_factory=list)
+
+
+class Node:
+    """Bytes and times in, bytes and estimates out; deterministic."""
+
+    def __init__(
+        self,
+        settings: AgentSettings,
+        endpoint: EndpointSettings,
+        *,
+        boot_id: int,
+        incarnation: int,
+        software: str,
+        sensors: dict[str, SensorConfig] | None = None,
+        recorder: Recorder | None = None,
+    ) -> None:
+        self.robot = settings.robot
+        self.agent = Agent(settings)
+        self.endpoint = Endpoint(
+            robot=settings.robot, boot_id=boot_id, incarnation=incarnation, settings=endpoint, software=software
+        )
+        self.counters: Counter[str] = Counter()
+        self._sensors = sensors or {}
+        self._recorder = recorder
+
+    def on_event(self, event: Event) -> Outgoing:
+        """An event made elsewhere (the autopilot reader, for instance)."""
+        out = Outgoing()
+        self._handle(event, out)
+        return out
+
+    def on_sensor(self, now_ns: int, payload: bytes) -> Outgoing:
+        """A sensor datagram."""
+        out = Outgoing()
+        try:
+            event = decode(payload, now_ns, self._sensors)
+        except SensorError as error:
+            self.counters[f"sensor.{error.reason}"] += 1
+            return out
+        self._handle(event, out)
+        return out
+
+    def on_packet(self, now_ns: int, packet: Packet) -> Outgoing:
+        """A packet from the network."""
+        out = Outgoing()
+        for item in self.endpoint.receive(now_ns, packet):
+            if isinstance(item, Delivery):
+                self._handle(Received(now_ns, item.message, item.offset_ns, item.offset_sigma_ns), out)
+            else:
+                self._handle(_link_change(now_ns, item), out)
+        return out
+
+    def on_tick(self, now_ns: int) -> Outgoing:
+        """Time has passed."""
+        out = Outgoing()
+        packets, changes = self.endpoint.tick(now_ns)
+        out.packets.extend(packets)
+        for change in changes:
+            self._handle(_link_change(now_ns, change), out)
+        if self.agent.next_deadline_ns() <= now_ns:
+            self._handle(Tick(now_ns), out)
+        return out
+
+    def next_deadline_ns(self) -> int:
+        return min(self.endpoint.next_deadline_ns(), self.agent.next_deadline_ns())
+
+    def _handle(self, event: Event, out: Outgoing) -> None:
+        effects = self.agent.handle(event)
+        if self._recorder is not None:
+            self._recorder(event, effects)
+        for effect in effects:
+            match effect:
+                case Send(peer, t_meas_ns, body):
+                    try:
+                        out.packets.append(self.endpoint.send(event.t_ns, peer, t_meas_ns, body))
+                    except OversizeError:
+                        self.counters["send.oversize"] += 1
+                case Broadcast(channel, t_meas_ns, body):
+                    out.packets.append(self.endpoint.broadcast(event.t_ns, channel, t_meas_ns, body))
+                case Publish(estimate):
+                    out.estimates.append(estimate)
+
+
+def _link_change(now_ns: int, change: PeerChange) -> LinkChange:
+    return LinkChange(now_ns, change.peer, change.up, change.incarnation, change.boot_id)
+
+
+def rejected(node: Node) -> dict[str, int]:
+    """All counters of things refused, by reason, sorted."""
+    reasons: Counter[str] = Counter()
+    for name, count in node.endpoint.counters.items():
+        if name.startswith("rejected."):
+            reasons[name.removeprefix("rejected.")] += count
+    for name, count in node.counters.items():
+        reasons[name] += count
+    for name, count in node.agent.counters.items():
+        if name.startswith(("observation.", "late.dropped", "late.target", "input.", "odometry.out", "fix.")):
+            reasons[name] += count
+    return dict(sorted(reasons.items()))

@@ -1,0 +1,139 @@
+"""The one documented way in for sensor data: a msgpack map per datagram, turned into core events.
+
+    {"t_ns": int, "kind": "range", "of": "r2" | "landmark:L3" | "target:t1" | None, "z": [4.21], "R": [[0.0025]]}
+
+kinds `range`, `bearing` (azimuth), `range_bearing`, `position`, `pose`, `heading`, and `odometry` (z = dx, dy, dz,
+dyaw over [t0_ns, t_ns]). Optional: "sensor" (its name in the config), "t0_ns" (odometry only). SI and radians,
+frames as in `agent.events`.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.estimation.gaussian import is_positive_definite
+from agent.events import Event, Fix, Observation, Odometry
+
+Array = NDArray[np.float64]
+
+MAX_DATAGRAM_BYTES = 2048
+MAX_VALUE = 1e9
+FLOOR = 1e-12
+
+SIZES = {
+    "range": 1,
+    "bearing": 1,
+    "range_bearing": 2,
+    "position": 2,
+    "pose": 3,
+    "heading": 1,
+    "odometry": 4,
+}
+ABSOLUTE_KINDS = ("position", "pose", "heading")
+
+_SUBJECT = re.compile(r"(?:landmark:[A-Za-z0-9_.-]{1,32}|target:[a-z0-9-]{1,24}|[a-z0-9-]{1,24})\Z")
+_SENSOR = re.compile(r"[A-Za-z0-9_.-]{1,32}\Z")
+_KEYS = frozenset({"t_ns", "t0_ns", "kind", "of", "z", "R", "sensor"})
+
+
+class SensorError(Exception):
+    """A datagram that is not a measurement; `reason` is the name of its counter."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+@dataclass(frozen=True, slots=True)
+class SensorConfig:
+    """What the robot knows of one of its sensors: where it sits on the body."""
+
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def encode(
+    t_ns: int, kind: str, z: Array, R: Array, *, of: str | None = None, sensor: str = "", t0_ns: int | None = None
+) -> bytes:
+    """The datagram a driver sends; z (m,), R (m, m)."""
+    data: dict[str, Any] = {"t_ns": t_ns, "kind": kind, "of": of, "z": z.tolist(), "R": R.tolist()}
+    if sensor:
+        data["sensor"] = sensor
+    if t0_ns is not None:
+        data["t0_ns"] = t0_ns
+    packed: bytes = msgpack.packb(data)
+    return packed
+
+
+def decode(payload: bytes, now_ns: int, sensors: dict[str, SensorConfig]) -> Event:
+    """The event a datagram stands for, handed in at `now_ns`. Raises `SensorError` on anything foreign."""
+    if len(payload) > MAX_DATAGRAM_BYTES:
+        raise SensorError("oversize")
+    try:
+        data = msgpack.unpackb(
+            payload,
+            strict_map_key=True,
+            max_str_len=64,
+            max_bin_len=0,
+            max_array_len=16,
+            max_map_len=8,
+            max_ext_len=0,
+        )
+    except Exception:
+        raise SensorError("malformed") from None
+    if type(data) is not dict or not _KEYS.issuperset(data):
+        raise SensorError("malformed")
+    kind = data.get("kind")
+    if type(kind) is not str or kind not in SIZES:
+        raise SensorError("unknown_kind")
+    t_ns = _stamp(data.get("t_ns"))
+    sensor = data.get("sensor", "")
+    if type(sensor) is not str or (sensor and not _SENSOR.match(sensor)):
+        raise SensorError("malformed")
+    size = SIZES[kind]
+    z = _array(data.get("z"), (size,))
+    R = _array(data.get("R"), (size, size))
+    if kind == "odometry":
+        t0_ns = _stamp(data.get("t0_ns"))
+        if t0_ns >= t_ns:
+            raise SensorError("bad_interval")
+        if np.any(np.diagonal(R) < 0.0) or not is_positive_definite(R + np.eye(size) * FLOOR):
+            raise SensorError("not_positive_definite")
+        return Odometry(now_ns, t0_ns, t_ns, z, R)
+    if not np.array_equal(R, R.T) or np.any(np.diagonal(R) < FLOOR) or not is_positive_definite(R):
+        raise SensorError("not_positive_definite")
+    if kind in ABSOLUTE_KINDS:
+        return Fix(now_ns, t_ns, kind, z, R, sensor)
+    of = data.get("of")
+    if of is not None and (type(of) is not str or not _SUBJECT.match(of)):
+        raise SensorError("bad_subject")
+    if kind != "bearing" and z[0] < 0.0:
+        raise SensorError("out_of_range")
+    mount = sensors[sensor].mount if sensor in sensors else (0.0, 0.0, 0.0)
+    return Observation(now_ns, t_ns, kind, of, z, R, sensor, mount)
+
+
+def _stamp(value: Any) -> int:
+    if type(value) is not int or not 0 <= value < 2**63:
+        raise SensorError("bad_stamp")
+    return value
+
+
+def _array(value: Any, shape: tuple[int, ...]) -> Array:
+    rows = value if len(shape) == 2 else [value]
+    if type(value) is not list or len(value) != shape[0]:
+        raise SensorError("wrong_length")
+    for row in rows:
+        if type(row) is not list or len(row) != shape[-1]:
+            raise SensorError("wrong_length")
+        if any(type(number) not in (int, float) for number in row):
+            raise SensorError("wrong_type")
+    array = np.array(value, dtype=np.float64)
+    if not np.all(np.isfinite(array)) or np.any(np.abs(array) > MAX_VALUE):
+        raise SensorError("out_of_range")
+    return array

@@ -1,0 +1,84 @@
+"""From a scenario to the configuration of each agent: the same tables whatever the runtime."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from agent.config import AgentConfig, validate
+from sim.scenario import RobotPart, Scenario, sensor_kind
+from sim.world import World, control_odometry
+
+FLEET = "sim"
+
+
+def table(part: Any) -> dict[str, Any]:
+    """A part as a plain table without absent keys."""
+    return dict(part.model_dump(exclude_none=True))
+
+
+def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str, Any]:
+    """The part of an agent's file that does not depend on the runtime."""
+    mean, _ = world.start_belief(robot.id)
+    targets = []
+    for target in scenario.targets:
+        target_mean, _ = world.start_belief(target.id)
+        targets.append(
+            {
+                "id": target.id,
+                "model": target.model,
+                "mean": [float(value) for value in target_mean],
+                "start_sigma": table(target.start_sigma),
+                "control": table(target.control),
+                "noise": table(target.noise),
+                "noise_step_s": scenario.step_s,
+                "damping_s": target.damping_s,
+            }
+        )
+    return {
+        "version": 1,
+        "identity": {"fleet": FLEET, "robot": robot.id, "incarnation": 1},
+        "origin": list(scenario.origin),
+        "initial": {
+            "source": "survey",
+            "mean": [float(value) for value in mean],
+            "start_sigma": table(robot.start_sigma),
+        },
+        "localization": table(scenario.localization_of(robot)),
+        "tracking": table(scenario.tracking_of(robot)),
+        "lateness": table(scenario.lateness_of(robot)),
+        "coast": table(scenario.coast),
+        "network": table(scenario.network),
+        "sensors": {
+            name: {"kind": sensor_kind(name, sensor), "mount": list(sensor.mount), "two_way": sensor.two_way}
+            for name, sensor in robot.sensors.items()
+        },
+        "targets": targets,
+        "landmarks": [
+            {"id": name, "position": [float(x), float(y)]} for name, (x, y) in world.landmarks.items()
+        ],
+        "zenoh": {"listen": [], "peers": []},
+        "state_dir": "state",
+    }
+
+
+def agent_config(scenario: Scenario, world: World, robot: RobotPart) -> AgentConfig:
+    """The validated configuration used in virtual time."""
+    return validate(AgentConfig, agent_tables(scenario, world, robot), robot.id)
+
+
+def odometry_table(scenario: Scenario, robot: RobotPart) -> dict[str, float]:
+    """The odometry noise an agent assumes for increments it reads from its autopilot.
+
+    Gains are left at one: the stand-in reports increments that are calibrated already.
+    """
+    noise = control_odometry(robot, scenario.step_s)
+    return {
+        "along_m_per_sqrt_s": noise.along_m_per_sqrt_s,
+        "along_m_per_sqrt_m": noise.along_m_per_sqrt_m,
+        "across_m_per_sqrt_s": noise.across_m_per_sqrt_s,
+        "vertical_m_per_sqrt_s": noise.vertical_m_per_sqrt_s,
+        "heading_rad_per_sqrt_s": noise.heading_rad_per_sqrt_s,
+        "heading_rad_per_sqrt_rad": noise.heading_rad_per_sqrt_rad,
+    }
+
+

@@ -1,0 +1,286 @@
+"""Scenario files: what a run consists of. `sim/scenarios/ut-clat.toml` is the commented example."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from agent.config import (
+    CoastPart,
+    ConfigError,
+    ControlNoisePart,
+    ControlPart,
+    Finite,
+    Id,
+    LandmarkPart,
+    LatenessPart,
+    LinksPart,
+    LocalizationPart,
+    NetworkPart,
+    OdometryPart,
+    Part,
+    Positive,
+    NotNegative,
+    SigmaPart,
+    TrackingPart,
+    Vector2,
+    Vector3,
+    read_toml,
+    validate,
+)
+
+Subject = Literal["peers", "landmarks", "targets"]
+
+
+class PlacementPart(Part):
+    """Where robots start: each on its circle at a phase drawn from the seed.
+
+    A draw is rejected until the contact graph over one lap (who comes within `contact_range_m` of whom on
+    undisturbed circles) connects every robot with `reaches`.
+    """
+
+    rule: Literal["random_phases"] = "random_phases"
+    contact_range_m: Positive
+    reaches: Id
+    max_draws: Annotated[int, Field(ge=1)] = 10000
+
+
+class WorldPart(Part):
+    kind: Literal["simulated", "recording"] = "simulated"
+    format: Literal["utias"] | None = None
+    path: str | None = None
+    placement: PlacementPart | None = None
+
+
+class CirclePart(Part):
+    center_m: Vector2
+    radius_m: Positive
+
+
+class StartPart(Part):
+    """True start: a pose (x, y, heading), a full target state, or a place on a circle drawn from the seed."""
+
+    pose: Annotated[list[Finite], Field(min_length=3, max_length=4)] | None = None
+    circle: CirclePart | None = None
+
+
+class SensorPart(Part):
+    """A sensor: what it measures (`kind`, by default its name), of whom, how well, how far and how often.
+
+    sigma_m grows by sigma_m_per_m with the distance. `rate_hz` absent: once per step.
+    """
+
+    kind: Literal["range", "bearing", "range_bearing", "position", "pose", "heading"] | None = None
+    of: list[Subject] = []
+    sigma_m: Positive | None = None
+    sigma_m_per_m: NotNegative = 0.0
+    sigma_rad: Positive | None = None
+    max_range_m: Positive | None = None
+    rate_hz: Positive | None = None
+    mount: Vector3 = [0.0, 0.0, 0.0]
+    two_way: bool = True
+
+
+class AutopilotPart(Part):
+    """What the vehicle's autopilot sends. A GPS-denied one sends odometry in a drifting local frame only."""
+
+    sends: list[Literal["odometry", "global_position", "attitude"]] = ["odometry", "attitude"]
+    flavour: Literal["ardupilot", "px4"] = "ardupilot"
+
+
+class RobotPart(Part):
+    id: Id
+    model: Literal["unicycle"] = "unicycle"
+    start: StartPart = StartPart()
+    start_sigma: SigmaPart
+    control: ControlPart = ControlPart()
+    noise: ControlNoisePart = ControlNoisePart()
+    odometry: OdometryPart | None = None
+    sensors: dict[str, SensorPart] = {}
+    autopilot: AutopilotPart = AutopilotPart()
+    localization: dict[str, Any] = {}
+    tracking: dict[str, Any] = {}
+    lateness: dict[str, Any] = {}
+
+
+class TargetPart(Part):
+    id: Id
+    model: Literal["unicycle", "constant_velocity", "damped_velocity"] = "unicycle"
+    start: StartPart
+    start_sigma: SigmaPart
+    control: ControlPart = ControlPart()
+    noise: ControlNoisePart = ControlNoisePart()
+    damping_s: Positive = 2.0
+
+
+class BoundPart(Part):
+    """A condition on one figure of the summary."""
+
+    min: Finite | None = None
+    max: Finite | None = None
+
+
+class Scenario(Part):
+    """A whole scenario."""
+
+    version: Literal[1]
+    name: Id
+    duration_s: Positive
+    step_s: Positive
+    window_s: Vector2
+    lost_above_m: Positive = 8.0
+    origin: Vector3 = [47.397742, 8.545594, 488.0]
+    world: WorldPart = WorldPart()
+    localization: LocalizationPart = LocalizationPart()
+    tracking: TrackingPart = TrackingPart()
+    lateness: LatenessPart = LatenessPart()
+    coast: CoastPart = CoastPart()
+    network: NetworkPart = NetworkPart()
+    links: LinksPart = LinksPart()
+    robots: Annotated[list[RobotPart], Field(min_length=1)]
+    targets: list[TargetPart] = []
+    landmarks: list[LandmarkPart] = []
+    expect: dict[str, BoundPart] = {}
+
+    def localization_of(self, robot: RobotPart) -> LocalizationPart:
+        return self._overridden(LocalizationPart, self.localization, robot, "localization")
+
+    def lateness_of(self, robot: RobotPart) -> LatenessPart:
+        return self._overridden(LatenessPart, self.lateness, robot, "lateness")
+
+    def tracking_of(self, robot: RobotPart) -> TrackingPart:
+        return self._overridden(TrackingPart, self.tracking, robot, "tracking")
+
+    def _overridden(self, model: Any, base: Part, robot: RobotPart, name: str) -> Any:
+        own = getattr(robot, name)
+        if not own:
+            return base
+        merged = {**base.model_dump(), **own}
+        try:
+            return validate(model, merged, f"robots.{robot.id}.{name}")
+        except ConfigError as error:
+            raise ConfigError(f"{self.name}: {error}") from None
+
+
+def bundled() -> list[str]:
+    """Names of the bundled scenarios."""
+    folder = resources.files("sim.scenarios")
+    return sorted(item.name.removesuffix(".toml") for item in folder.iterdir() if item.name.endswith(".toml"))
+
+
+def locate(name: str) -> Path:
+    """The file of a scenario given by path or bundled name. Raises `ConfigError` with the nearest name."""
+    path = Path(name)
+    if path.suffix == ".toml" or path.exists():
+        return path
+    if name in bundled():
+        return Path(str(resources.files("sim.scenarios") / f"{name}.toml"))
+    near = difflib.get_close_matches(name, bundled(), n=1, cutoff=0.4)
+    hint = f"did you mean '{near[0]}'?" if near else "bundled: " + ", ".join(bundled())
+    raise ConfigError(f"no scenario '{name}': {hint}")
+
+
+def load(name: str, overrides: list[str] | None = None) -> Scenario:
+    """Read a scenario and apply `--set` overrides (`links.loss=0.3`, `robots.r2.sensors.range.sigma_m=0.1`)."""
+    path = locate(name)
+    data = read_toml(path)
+    for override in overrides or []:
+        apply_override(data, override)
+    scenario = validate(Scenario, data, str(path))
+    check(scenario)
+    return scenario
+
+
+def apply_override(data: dict[str, Any], override: str) -> None:
+    """Set one dotted key; entries of arrays of tables go by their id, `*` meaning all of them."""
+    key, separator, text = override.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(f"--set {override}: write KEY=VALUE, for instance links.loss=0.3")
+    _assign(data, key.strip().split("."), _parse(text.strip()), override)
+
+
+def _parse(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _assign(here: dict[str, Any], path: list[str], value: Any, override: str) -> None:
+    head, rest = path[0], path[1:]
+    if not rest:
+        here[head] = value
+        return
+    below = here.setdefault(head, {})
+    if isinstance(below, list):
+        entries = [item for item in below if isinstance(item, dict) and (rest[0] == "*" or item.get("id") == rest[0])]
+        if not entries:
+            ids = ", ".join(str(item.get("id")) for item in below if isinstance(item, dict))
+            raise ConfigError(f"--set {override}: no '{rest[0]}' in {head}; there are: {ids}")
+        if len(rest) == 1:
+            raise ConfigError(f"--set {override}: name a key of {head}.{rest[0]}")
+        for entry in entries:
+            _assign(entry, rest[1:], value, override)
+        return
+    if not isinstance(below, dict):
+        raise ConfigError(f"--set {override}: '{head}' is a value, not a table")
+    _assign(below, rest, value, override)
+
+
+def check(scenario: Scenario) -> None:
+    """What no single key can tell. Raises `ConfigError`."""
+    ids = [robot.id for robot in scenario.robots] + [target.id for target in scenario.targets]
+    for name in ids:
+        if ids.count(name) > 1:
+            raise ConfigError(f"{scenario.name}: id '{name}' is used twice; ids must differ")
+    if not 0.0 <= scenario.window_s[0] < scenario.window_s[1]:
+        raise ConfigError(f"{scenario.name}: window_s must be [from, to] with from < to")
+    if scenario.window_s[0] >= scenario.duration_s:
+        raise ConfigError(
+            f"{scenario.name}: window_s starts at {scenario.window_s[0]:g} s, after the run's end at "
+            f"{scenario.duration_s:g} s; shorten it with --set 'window_s=[0, {scenario.duration_s:g}]'"
+        )
+    recorded = scenario.world.kind == "recording"
+    if recorded and scenario.world.path is None:
+        raise ConfigError(f"{scenario.name}: world.path is missing; add --set world.path=FOLDER of the recording")
+    for robot in scenario.robots:
+        robot.start_sigma.covariance(robot.model)
+        scenario.localization_of(robot), scenario.lateness_of(robot), scenario.tracking_of(robot)
+        if not recorded and (robot.start.pose is None) == (robot.start.circle is None):
+            raise ConfigError(f"{scenario.name}: robots.{robot.id}.start needs either 'pose' or 'circle'")
+        if robot.start.circle is not None and scenario.world.placement is None:
+            raise ConfigError(f"{scenario.name}: robots.{robot.id}.start.circle needs a [world.placement]")
+        for name, sensor in robot.sensors.items():
+            check_sensor(f"{scenario.name}: robots.{robot.id}.sensors.{name}", name, sensor)
+    for target in scenario.targets:
+        target.start_sigma.covariance(target.model)
+        if target.start.pose is None:
+            raise ConfigError(f"{scenario.name}: targets.{target.id}.start.pose is missing")
+
+
+KINDS = ("range", "bearing", "range_bearing", "position", "pose", "heading")
+
+
+def sensor_kind(name: str, sensor: SensorPart) -> str:
+    """The kind of a sensor: stated, or its name."""
+    return sensor.kind if sensor.kind is not None else name
+
+
+def check_sensor(where: str, name: str, sensor: SensorPart) -> None:
+    """Raises `ConfigError` if the sensor lacks a kind, a subject or a standard deviation."""
+    kind = sensor_kind(name, sensor)
+    if kind not in KINDS:
+        raise ConfigError(f"{where}: state its kind, one of {', '.join(KINDS)}")
+    needs_m = kind in ("range", "range_bearing", "position", "pose")
+    needs_rad = kind in ("bearing", "range_bearing", "pose", "heading")
+    if needs_m and sensor.sigma_m is None:
+        raise ConfigError(f"{where}: sigma_m is missing")
+    if needs_rad and sensor.sigma_rad is None:
+        raise ConfigError(f"{where}: sigma_rad is missing")
+    if kind in ("range", "bearing", "range_bearing") and not sensor.of:
+        raise ConfigError(f"{where}: of is missing, for instance of = [\"peers\"]")
