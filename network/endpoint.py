@@ -204,7 +204,9 @@ class Endpoint:
         header, body = message.header, message.body
         peer = self._table.get(header.source)
         if peer is not None:
-            refusal = peer.refusal(header.boot_id, header.incarnation, packet.channel, header.seq)
+            refusal = peer.refusal(
+                header.t_send_ns, header.boot_id, header.incarnation, packet.channel, header.seq
+            )
             if refusal is not None:
                 raise WireError(refusal)
         self._check_age(now_ns, header, peer)

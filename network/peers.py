@@ -1,7 +1,9 @@
 """Who is out there: duplicates refused, lives told apart, silence noticed.
 
-A life of a robot is a pair (incarnation, boot id). A new life has a higher incarnation, or the same
-incarnation and a boot id never seen in it. Messages of earlier lives are refused.
+A life of a robot is a pair (incarnation, boot id). A new life has a higher incarnation, or the same one, a
+boot id not superseded before, and was sent later than everything heard of the present life: without the last
+condition a straggler of a boot that ended before we first listened would supersede the living one for good.
+Messages of earlier lives are refused.
 """
 
 from __future__ import annotations
@@ -56,6 +58,7 @@ class Peer:
         self.up = False
         self.heard_ns = 0
         self.sent_ns = 0
+        self._latest_sent_ns = -1
         self.clock = PeerClock()
         self.counters: Counter[str] = Counter()
         self._superseded: deque[int] = deque(maxlen=MAX_BOOT_IDS)
@@ -65,13 +68,19 @@ class Peer:
         """Whether a message of this life begins a new one; meaningful only if it is not of an old life."""
         return (boot_id, incarnation) != (self.boot_id, self.incarnation)
 
-    def is_old_life(self, boot_id: int, incarnation: int) -> bool:
+    def is_old_life(self, boot_id: int, incarnation: int, t_send_ns: int) -> bool:
         """Whether a message of this life comes from before the present one."""
-        return incarnation < self.incarnation or boot_id in self._superseded
+        if incarnation != self.incarnation:
+            return incarnation < self.incarnation or boot_id in self._superseded
+        if boot_id == self.boot_id:
+            return False
+        return boot_id in self._superseded or t_send_ns <= self._latest_sent_ns
 
-    def refusal(self, boot_id: int, incarnation: int, channel: str, seq: int) -> str | None:
+    def refusal(
+        self, t_send_ns: int, boot_id: int, incarnation: int, channel: str, seq: int
+    ) -> str | None:
         """Why a message is refused, or None: "old_life", "duplicate", "too_old_seq". Nothing is recorded."""
-        if self.is_old_life(boot_id, incarnation):
+        if self.is_old_life(boot_id, incarnation, t_send_ns):
             return "old_life"
         window = self._windows.get(channel)
         if window is None or self.is_new_life(boot_id, incarnation):
@@ -88,12 +97,14 @@ class Peer:
                 self._superseded.append(self.boot_id)
             self.boot_id, self.incarnation = boot_id, incarnation
             self._windows.clear()
+            self._latest_sent_ns = -1
             self.clock = PeerClock()
             self.counters["lives"] += 1
             changed = True
         self._windows.setdefault(channel, DuplicateWindow()).record(seq)
         self.up = True
         self.heard_ns, self.sent_ns = now_ns, t_send_ns
+        self._latest_sent_ns = max(self._latest_sent_ns, t_send_ns)
         self.counters["accepted"] += 1
         return changed
 

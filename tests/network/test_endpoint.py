@@ -390,6 +390,7 @@ class LossyPipe(RuleBasedStateMachine):
 
     @rule(robot=st.sampled_from(["r1", "r2"]))
     def restart(self, robot: str) -> None:
+        self.now_ns += MS
         self.boots[robot] += 1
         self.ends[robot] = endpoint(robot, boot_id=self.boots[robot])
         # What it was told in an earlier life may reach it again: it has no memory of it.

@@ -24,7 +24,7 @@ def test_the_window_agrees_with_remembering_everything(sequence: list[int]) -> N
 
 
 def heard(peer: Peer, boot_id: int, incarnation: int, seq: int, channel: str = "pair", t_ns: int = 0) -> str:
-    refusal = peer.refusal(boot_id, incarnation, channel, seq)
+    refusal = peer.refusal(t_ns, boot_id, incarnation, channel, seq)
     if refusal is not None:
         return refusal
     return "change" if peer.accept(t_ns, t_ns, boot_id, incarnation, channel, seq) else "known"
@@ -41,25 +41,32 @@ def test_the_first_message_brings_a_peer_up_once() -> None:
 def test_a_restart_is_a_new_life_and_the_old_one_is_over() -> None:
     peer = Peer("r2", 7, 1)
     heard(peer, 7, 1, 900)
-    assert heard(peer, 8, 1, 0) == "change"
-    assert heard(peer, 7, 1, 901) == "old_life"
-    assert heard(peer, 8, 1, 0) == "duplicate"
+    assert heard(peer, 8, 1, 0, t_ns=1) == "change"
+    assert heard(peer, 7, 1, 901, t_ns=2) == "old_life"
+    assert heard(peer, 8, 1, 0, t_ns=1) == "duplicate"
+
+
+def test_a_straggler_of_a_boot_never_heard_does_not_displace_the_living() -> None:
+    peer = Peer("r2", 8, 1)
+    heard(peer, 8, 1, 0, t_ns=5)
+    assert heard(peer, 7, 1, 400, t_ns=4) == "old_life"
+    assert heard(peer, 8, 1, 1, t_ns=6) == "known"
 
 
 def test_a_higher_incarnation_is_a_new_life_of_the_same_boot() -> None:
     peer = Peer("r2", 7, 1)
     heard(peer, 7, 1, 3)
     assert heard(peer, 7, 2, 3) == "change"
-    assert heard(peer, 7, 1, 4) == "old_life"
-    assert heard(peer, 9, 1, 0) == "old_life"
+    assert heard(peer, 7, 1, 4, t_ns=1) == "old_life"
+    assert heard(peer, 9, 1, 0, t_ns=1) == "old_life"
 
 
 def test_remembered_boot_ids_are_bounded() -> None:
     peer = Peer("r2", 0, 1)
     for boot_id in range(MAX_BOOT_IDS + 2):
-        assert heard(peer, boot_id, 1, 0) == "change"
-    assert heard(peer, MAX_BOOT_IDS, 1, 0) == "old_life"
-    assert heard(peer, 0, 1, 0) == "change"
+        assert heard(peer, boot_id, 1, 0, t_ns=boot_id) == "change"
+    assert heard(peer, MAX_BOOT_IDS, 1, 0, t_ns=99) == "old_life"
+    assert heard(peer, 0, 1, 0, t_ns=99) == "change"
 
 
 def table_of(*robots: str, t_ns: int = 0) -> PeerTable:
