@@ -215,9 +215,7 @@ class Endpoint:
             if peer is None:
                 raise WireError("too_many_peers")
         events: list[Delivery | PeerChange] = []
-        if peer.accept(
-            now_ns, header.t_send_ns, header.boot_id, header.incarnation, packet.channel, header.seq
-        ):
+        if peer.accept(now_ns, header.t_send_ns, header.boot_id, header.incarnation, packet.channel, header.seq):
             events.append(_change(peer))
         if isinstance(body, Hello):
             self.counters["hellos"] += 1
@@ -258,9 +256,7 @@ class Endpoint:
 
     def _take_echo(self, now_ns: int, header: Header, hello: Hello, peer: Peer) -> None:
         for echo in hello.echoes:
-            if echo.peer == self.robot and not peer.clock.add(
-                echo.t1_ns, echo.t2_ns, header.t_send_ns, now_ns
-            ):
+            if echo.peer == self.robot and not peer.clock.add(echo.t1_ns, echo.t2_ns, header.t_send_ns, now_ns):
                 self.counters["clock_refused"] += 1
                 peer.counters["clock_refused"] += 1
 

@@ -76,9 +76,7 @@ class Peer:
             return False
         return boot_id in self._superseded or t_send_ns <= self._latest_sent_ns
 
-    def refusal(
-        self, t_send_ns: int, boot_id: int, incarnation: int, channel: str, seq: int
-    ) -> str | None:
+    def refusal(self, t_send_ns: int, boot_id: int, incarnation: int, channel: str, seq: int) -> str | None:
         """Why a message is refused, or None: "old_life", "duplicate", "too_old_seq". Nothing is recorded."""
         if self.is_old_life(boot_id, incarnation, t_send_ns):
             return "old_life"
@@ -87,9 +85,7 @@ class Peer:
             return None
         return window.refusal(seq)
 
-    def accept(
-        self, now_ns: int, t_send_ns: int, boot_id: int, incarnation: int, channel: str, seq: int
-    ) -> bool:
+    def accept(self, now_ns: int, t_send_ns: int, boot_id: int, incarnation: int, channel: str, seq: int) -> bool:
         """Record a message that was not refused; True if the peer came up or began a new life with it."""
         changed = not self.up
         if self.is_new_life(boot_id, incarnation):

@@ -195,9 +195,7 @@ short = st.text(max_size=8)
 
 @settings(max_examples=200, deadline=None)
 @given(short, short, st.none() | st.just("r1"), st.binary(max_size=1300), st.integers())
-def test_no_packet_raises(
-    source: str, channel: str, destination: str | None, payload: bytes, now_ns: int
-) -> None:
+def test_no_packet_raises(source: str, channel: str, destination: str | None, payload: bytes, now_ns: int) -> None:
     end = endpoint("r1")
     assert end.receive(now_ns, Packet(source, channel, destination, payload)) == []
     assert adds_up(end)
