@@ -20,19 +20,20 @@ from numpy.typing import NDArray
 from agent.estimation.motion import LAYOUTS
 from agent.node import Node, Outgoing, Recorder, rejected
 from agent.sensor_input import encode
-from network.links import LinkModel, RangeTable, hear
+from network.links import FateRecord, LinkModel, RangeTable
 from network.messages import Packet
 from network.wire import peek_header
 from sim.agents import agent_config
 from sim.bound import BoundRunner
 from sim.metrics import StateTrace, TrialTrace
 from sim.scenario import Scenario
-from sim.world import Output, World, positions
+from sim.reach import Reach
+from sim.world import Output, World
 
 Array = NDArray[np.float64]
-FateSink = Callable[[dict[str, Any]], None]
+FateSink = Callable[[FateRecord], None]
 
-SOFTWARE = "cofix/0.1"
+SOFTWARE = "cofix-0.1.0"
 DELIVERY, TIMER = -1, 99
 
 
@@ -160,6 +161,8 @@ class VirtualEngine:
                 recorder=(recorders or {}).get(robot.id),
             )
         self._range = RangeTable()
+        links = scenario.links
+        self._reach = None if links.range_m is None else Reach(world, links.range_m, links.hysteresis_m)
         self._links = LinkModel(scenario.links.settings(seed), self._range.state, fate_sink)
         self._sampler = Sampler(scenario, world, with_bound)
         self._bound = BoundRunner(scenario, world) if with_bound else None
@@ -257,15 +260,8 @@ class VirtualEngine:
         self._push(deadline, TIMER, robot, None)
 
     def _publish_range(self, k: int) -> None:
-        links = self._scenario.links
-        if links.range_m is None:
-            return
-        place = positions(self._world, k)
-        gaps = np.linalg.norm(place[:, None] - place[None], axis=-1)
-        self._range.publish(
-            k * self._world.step_ns,
-            hear(self._range.latest, self._world.robots, gaps, links.range_m, links.hysteresis_m),
-        )
+        if self._reach is not None:
+            self._range.publish(k * self._world.step_ns, self._reach.at(k))
 
     def _sample(self, k: int) -> None:
         row = self._sampler.row(k)

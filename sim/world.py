@@ -58,11 +58,6 @@ class World(Protocol):
         ...
 
 
-def positions(world: World, k: int) -> Array:
-    """True positions (robots, 2) at instant k."""
-    return np.array([world.truth(robot, k)[:2] for robot in world.robots])
-
-
 def control_odometry(robot: RobotPart, step_s: float) -> OdometryNoise:
     """The odometry noise a robot's estimator assumes: stated, or that of its control noise."""
     if robot.odometry is not None:
