@@ -1,0 +1,60 @@
+"""The line between a process of a run and its launcher: JSON lines over a local Unix socket.
+
+    process -> launcher   {"hello": id}, {"ready": id}, {"status": {...}}, {"done": {...}}, {"failed": "why"}
+    launcher -> process   {"start": {"t0_ns": ..., "monotonic0_ns": ...}}, {"stop": true}
+
+The end of the stream counts as a stop: no process outlives its launcher.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from typing import Any
+
+
+class ControlLine:
+    """A process's end of the line."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._writer: asyncio.StreamWriter | None = None
+        self._task: asyncio.Task[None] | None = None
+        self.started: asyncio.Future[dict[str, int]] | None = None
+        self.stopped = asyncio.Event()
+
+    async def connect(self, path: str) -> None:
+        """Connect and say hello. Raises OSError when nobody listens."""
+        reader, self._writer = await asyncio.open_unix_connection(path)
+        self.started = asyncio.get_running_loop().create_future()
+        self._task = asyncio.create_task(self._read(reader))
+        self.say({"hello": self._name})
+
+    def say(self, message: dict[str, Any]) -> None:
+        """Send one line; silently nothing once the launcher is gone."""
+        if self._writer is not None and not self._writer.is_closing():
+            self._writer.write(json.dumps(message).encode() + b"\n")
+
+    async def _read(self, reader: asyncio.StreamReader) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            while line := await reader.readline():
+                message = json.loads(line)
+                if "start" in message and self.started is not None and not self.started.done():
+                    self.started.set_result(message["start"])
+                if message.get("stop"):
+                    break
+        self.stopped.set()
+        if self.started is not None and not self.started.done():
+            self.started.cancel()
+
+    async def close(self) -> None:
+        if self._writer is not None:
+            with contextlib.suppress(OSError):
+                await self._writer.drain()
+                self._writer.close()
+                await self._writer.wait_closed()
+        if self._task is not None:
+            self._task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._task

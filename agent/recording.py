@@ -1,0 +1,193 @@
+"""Boundary recording: every event that enters a core and every effect that leaves it, in one MCAP file.
+
+A recording holds the agent's configuration too, so it can be played back into a core anywhere; on one machine
+the effects come out bit for bit the same. Topics: `<robot>/events`, `<robot>/effects`, message encoding msgpack.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import msgpack
+import numpy as np
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from agent import effects as effect_types
+from agent import events as event_types
+from agent.config import AgentConfig
+from agent.core import Agent
+from agent.effects import Effect, Estimate, Publish
+from agent.events import Event
+from network import messages as message_types
+
+_TYPES: dict[str, type] = {
+    name: value
+    for module in (message_types, event_types, effect_types)
+    for name, value in vars(module).items()
+    if isinstance(value, type) and is_dataclass(value)
+}
+_TYPES["ReplyStatus"] = message_types.ReplyStatus
+
+
+class RecordingError(ValueError):
+    """A recording that cannot be read; the message names the file and what is wrong."""
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return {"@": "array", "shape": list(value.shape), "data": np.ascontiguousarray(value, "<f8").tobytes()}
+    if isinstance(value, message_types.ReplyStatus):
+        return {"@": "ReplyStatus", "value": int(value)}
+    if is_dataclass(value) and not isinstance(value, type):
+        return {"@": type(value).__name__, **{f.name: _plain(getattr(value, f.name)) for f in fields(value)}}
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return value
+
+
+def _object(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(_object(item) for item in value)
+    if not isinstance(value, dict):
+        return value
+    name = value.get("@")
+    if name == "array":
+        return np.frombuffer(value["data"], "<f8").reshape(value["shape"]).copy()
+    if name == "ReplyStatus":
+        return message_types.ReplyStatus(value["value"])
+    if name is None:
+        return {key: _object(item) for key, item in value.items()}
+    return _TYPES[name](**{key: _object(item) for key, item in value.items() if key != "@"})
+
+
+def pack(value: Event | Effect) -> bytes:
+    """An event or effect as bytes; arrays keep every bit."""
+    data: bytes = msgpack.packb(_plain(value))
+    return data
+
+
+def unpack(data: bytes) -> Any:
+    """The event or effect that `pack` was given."""
+    return _object(msgpack.unpackb(data))
+
+
+class RecordingWriter:
+    """Writes the boundary of one or several cores to a file."""
+
+    def __init__(self, path: Path) -> None:
+        self._file: BinaryIO = path.open("wb")
+        self._writer = Writer(self._file, compression=CompressionType.NONE)
+        self._writer.start(profile="cofix", library="cofix")
+        self._channels: dict[str, int] = {}
+        self._sequence = 0
+
+    def add_robot(self, config: AgentConfig, start_ns: int) -> None:
+        """Announce a robot: its configuration and the instant its core started at."""
+        robot = config.identity.robot
+        self._writer.add_metadata(
+            f"agent/{robot}", {"config": json.dumps(config.model_dump()), "start_ns": str(start_ns)}
+        )
+
+    def record(self, robot: str, event: Event, effects: list[Effect]) -> None:
+        """One call of a core."""
+        self._add(f"{robot}/events", event.t_ns, pack(event))
+        for effect in effects:
+            self._add(f"{robot}/effects", event.t_ns, pack(effect))
+
+    def _add(self, topic: str, t_ns: int, data: bytes) -> None:
+        if topic not in self._channels:
+            self._channels[topic] = self._writer.register_channel(topic, "msgpack", 0)
+        self._sequence += 1
+        stamp = max(t_ns, 0)
+        self._writer.add_message(self._channels[topic], stamp, data, stamp, self._sequence)
+
+    def close(self) -> None:
+        """Finish the file; a file that was not closed is refused by readers."""
+        self._writer.finish()
+        self._file.close()
+
+
+def _open(path: Path) -> Any:
+    try:
+        reader = make_reader(path.open("rb"))
+        if reader.get_summary() is None:
+            raise RecordingError(f"{path}: the recording was not finished; record it again")
+        return reader
+    except FileNotFoundError:
+        raise RecordingError(f"{path}: no such file") from None
+    except RecordingError:
+        raise
+    except Exception:
+        raise RecordingError(f"{path}: not a complete MCAP recording; record it again") from None
+
+
+def read_agents(path: Path) -> dict[str, tuple[AgentConfig, int]]:
+    """Configuration and start instant of every robot in a recording. Raises `RecordingError`."""
+    agents = {}
+    for record in _open(path).iter_metadata():
+        if record.name.startswith("agent/"):
+            config = AgentConfig.model_validate(json.loads(record.metadata["config"]))
+            agents[record.name.removeprefix("agent/")] = (config, int(record.metadata["start_ns"]))
+    if not agents:
+        raise RecordingError(f"{path}: holds no agent; it was not written by cofix")
+    return agents
+
+
+def read_boundary(path: Path, robot: str) -> Iterator[tuple[Event, list[bytes]]]:
+    """Events of a robot in order, each with the packed effects that followed it."""
+    event: Event | None = None
+    followed: list[bytes] = []
+    topics = [f"{robot}/events", f"{robot}/effects"]
+    for _, channel, message in _open(path).iter_messages(topics=topics, log_time_order=False):
+        if channel.topic.endswith("/events"):
+            if event is not None:
+                yield event, followed
+            event, followed = unpack(message.data), []
+        else:
+            followed.append(message.data)
+    if event is not None:
+        yield event, followed
+
+
+def read_estimates(path: Path, robot: str) -> Iterator[Estimate]:
+    """All estimates a robot published, in order."""
+    for _, packed in read_boundary(path, robot):
+        for data in packed:
+            effect = unpack(data)
+            if isinstance(effect, Publish):
+                yield effect.estimate
+
+
+def replay(path: Path, robot: str) -> tuple[int, int, int | None]:
+    """Play a robot's events into a fresh core.
+
+    Returns (events, effects, index of the first event whose effects differ or None).
+    """
+    config, start_ns = read_agents(path)[robot]
+    agent = Agent(config.settings(start_ns))
+    events = effects = 0
+    for event, recorded in read_boundary(path, robot):
+        made = [pack(effect) for effect in agent.handle(event)]
+        if made != recorded:
+            return events, effects, events
+        events += 1
+        effects += len(made)
+    return events, effects, None
+
+
+def merge(paths: dict[str, Path], target: Path) -> None:
+    """Write the recordings of several robots into one file."""
+    writer = RecordingWriter(target)
+    for robot, path in paths.items():
+        config, start_ns = read_agents(path)[robot]
+        writer.add_robot(config, start_ns)
+        for event, packed in read_boundary(path, robot):
+            writer.record(robot, event, [unpack(data) for data in packed])
+    writer.close()

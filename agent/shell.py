@@ -1,0 +1,351 @@
+"""The asyncio shell of one robot: sockets, clocks and files around the pure node.
+
+It opens the transport, the autopilot's link and the sensor socket, hands everything that comes in to the node
+with the fleet time, and carries out what comes back. Nothing of the estimation is decided here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import csv
+import logging
+import os
+import secrets
+import signal
+import socket
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import msgpack
+
+from agent.autopilot import AutopilotReader
+from agent.config import AgentConfig, ConfigError
+from agent.control import ControlLine
+from agent.effects import Estimate
+from agent.events import Event
+from agent.fleet_clock import FleetClock
+from agent.mavlink import MavlinkLink
+from agent.node import Node, Outgoing, rejected
+from agent.recording import RecordingWriter
+from agent.state_file import next_incarnation
+from network.injected_transport import LinkInjector
+from network.link_feed import LinkFeed
+from network.links import FateRecord, LinkModel, RangeTable
+from network.messages import Channel, Packet
+from network.zenoh_transport import ZenohSettings, ZenohTransport
+
+log = logging.getLogger("cofix.agent")
+
+SOFTWARE = "cofix-0.1.0"
+PUBLISH_INTERVAL_S = 0.1
+STATUS_INTERVAL_S = 0.5
+MAX_SOCKET_PATH = 100
+
+
+class _SensorProtocol(asyncio.DatagramProtocol):
+    def __init__(self, shell: AgentShell) -> None:
+        self._shell = shell
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:
+        self._shell.on_sensor(data)
+
+
+class AgentShell:
+    """Runs one agent until it is told to stop."""
+
+    def __init__(self, config: AgentConfig) -> None:
+        self.config = config
+        self.robot = config.identity.robot
+        self._state_dir = Path(config.state_dir)
+        self._clock = FleetClock()
+        self._node: Node | None = None
+        self._transport: ZenohTransport | None = None
+        self._mavlink: MavlinkLink | None = None
+        self._reader: AutopilotReader | None = None
+        self._feed: LinkFeed | None = None
+        self._recording: RecordingWriter | None = None
+        self._control: ControlLine | None = None
+        self._sensor_transport: asyncio.BaseTransport | None = None
+        self._receive: Any = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_due_ns = 0
+        self._published_s = 0.0
+        self._lag_ns = 0
+        self._stop = asyncio.Event()
+        self.counters: Counter[str] = Counter()
+        self._incarnation = 1
+        self._fates: Any = None
+        self._fate_file: Any = None
+
+    async def run(self) -> None:
+        """Start, work, stop. Raises ConfigError, TransportError, MavlinkError or OSError when it cannot start."""
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, self._stop.set)
+        try:
+            await self._open()
+            if self._control is not None:
+                self._control.say({"ready": self.robot})
+            if not await self._started():
+                return
+            await self._begin()
+            await self._work()
+        finally:
+            await self._close()
+
+    # -- start ----------------------------------------------------------------------------------------------
+
+    async def _open(self) -> None:
+        config = self.config
+        try:
+            self._state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+            counted = config.identity.incarnation
+            self._incarnation = counted if counted is not None else next_incarnation(self._state_dir, time.time_ns())
+        except OSError as error:
+            raise ConfigError(f"state_dir {self._state_dir} cannot be written: {error.strerror}") from None
+        if config.control_socket is not None:
+            self._control = ControlLine(self.robot)
+            await self._control.connect(config.control_socket)
+        self._boot_id = secrets.randbits(53)
+        settings = ZenohSettings(
+            fleet=config.identity.fleet,
+            robot=self.robot,
+            boot_id=self._boot_id,
+            listen=tuple(config.zenoh.listen),
+            connect=tuple((peer.id, tuple(peer.endpoints)) for peer in config.zenoh.peers),
+            lease_ms=config.zenoh.lease_ms,
+        )
+        self._receive = self._on_packet
+        if config.injection is not None:
+            await self._inject(config.injection)
+        self._transport = ZenohTransport(settings, lambda packet: self._receive(packet))
+        await self._transport.start()
+        await self._open_sensor_socket()
+
+    async def _inject(self, injection: Any) -> None:
+        table = RangeTable()
+        if injection.fate_log is not None:
+            self._fate_file = Path(injection.fate_log).open("w", newline="")  # noqa: SIM115
+            self._fates = csv.writer(self._fate_file)
+        links = LinkModel(injection.links.settings(injection.seed), table.state, self._log_fate)
+        if injection.table is not None:
+            self._feed = LinkFeed()
+            await self._feed.follow(injection.table, table.publish)
+        loop = asyncio.get_running_loop()
+        injector = LinkInjector(
+            self.robot,
+            links,
+            lambda: self._clock.now_ns(),
+            lambda wait_ns, call: loop.call_later(self._clock.wall_s(wait_ns), call),
+            self._on_packet,
+        )
+        self._receive = injector.on_packet
+
+    def _log_fate(self, record: FateRecord) -> None:
+        if self._fates is not None:
+            self._fates.writerow(fate_row(record))
+
+    async def _open_sensor_socket(self) -> None:
+        path = self._state_dir / "sensors.sock"
+        if len(os.fsencode(path)) > MAX_SOCKET_PATH:
+            raise ConfigError(f"state_dir {self._state_dir} is too long for a socket: choose a shorter path")
+        path.unlink(missing_ok=True)
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        previous = os.umask(0o177)
+        try:
+            listener.bind(str(path))
+        finally:
+            os.umask(previous)
+        listener.setblocking(False)
+        loop = asyncio.get_running_loop()
+        self._sensor_transport, _ = await loop.create_datagram_endpoint(lambda: _SensorProtocol(self), sock=listener)
+
+    async def _started(self) -> bool:
+        """Wait at the barrier and set the clock; False when stopped before the start."""
+        clock = self.config.clock
+        if clock.source == "system":
+            return True
+        if self._control is None or self._control.started is None:
+            raise ConfigError("clock.source = 'run' needs control_socket: the launcher starts the clock")
+        stop = asyncio.ensure_future(self._stop.wait())
+        await asyncio.wait({self._control.started, stop}, return_when=asyncio.FIRST_COMPLETED)
+        stop.cancel()
+        if self._stop.is_set() or self._control.started.cancelled() or not self._control.started.done():
+            return False
+        begin = self._control.started.result()
+        self._clock = FleetClock(begin["t0_ns"], begin["monotonic0_ns"], clock.speed)
+        return True
+
+    async def _begin(self) -> None:
+        config = self.config
+        start_ns = self._clock.t0_ns if config.clock.source == "run" else self._clock.now_ns()
+        if config.recording is not None:
+            self._recording = RecordingWriter(Path(config.recording))
+            self._recording.add_robot(config, start_ns)
+        self._node = Node(
+            config.settings(start_ns),
+            config.network.settings(config.lateness.horizon_s),
+            boot_id=self._boot_id,
+            incarnation=self._incarnation,
+            software=SOFTWARE,
+            sensors=config.sensor_configs(),
+            recorder=self._record if self._recording is not None else None,
+        )
+        if config.mavlink is not None:
+            self._reader = AutopilotReader(config.mavlink.settings(list(config.origin)))
+            self._mavlink = MavlinkLink(config.mavlink.endpoint, self._reader, self._clock, self.on_event)
+            await self._mavlink.start()
+        self._arm()
+
+    def _record(self, event: Event, effects: list[Any]) -> None:
+        assert self._recording is not None
+        self._recording.record(self.robot, event, effects)
+
+    # -- work -----------------------------------------------------------------------------------------------
+
+    async def _work(self) -> None:
+        waits = [asyncio.ensure_future(self._stop.wait())]
+        if self._control is not None:
+            waits.append(asyncio.ensure_future(self._control.stopped.wait()))
+        while not any(wait.done() for wait in waits):
+            await asyncio.wait(waits, timeout=STATUS_INTERVAL_S, return_when=asyncio.FIRST_COMPLETED)
+            status = self.status()
+            if self._control is not None:
+                self._control.say({"status": status})
+            if self._transport is not None:
+                self._transport.publish(Channel.STATUS, msgpack.packb(status))
+        for wait in waits:
+            wait.cancel()
+
+    def on_sensor(self, data: bytes) -> None:
+        """A datagram on the sensor socket."""
+        if self._node is not None:
+            self._carry_out(self._node.on_sensor(self._clock.now_ns(), data))
+
+    def on_event(self, event: Event) -> None:
+        """An event of the autopilot's reader."""
+        if self._node is not None:
+            self._carry_out(self._node.on_event(event))
+
+    def _on_packet(self, packet: Packet) -> None:
+        if self._node is not None:
+            self._carry_out(self._node.on_packet(self._clock.now_ns(), packet))
+
+    def _on_timer(self) -> None:
+        assert self._node is not None
+        now_ns = self._clock.now_ns()
+        self._timer = None
+        self._lag_ns = max(self._lag_ns, now_ns - self._timer_due_ns)
+        self._carry_out(self._node.on_tick(now_ns))
+
+    def _carry_out(self, out: Outgoing) -> None:
+        assert self._transport is not None
+        for packet in out.packets:
+            self._transport.send(packet)
+        if out.estimates:
+            wall = time.monotonic()
+            if wall - self._published_s >= PUBLISH_INTERVAL_S:
+                self._published_s = wall
+                self._transport.publish(Channel.ESTIMATE, estimate_bytes(out.estimates[-1]))
+        self._arm()
+
+    def _arm(self) -> None:
+        """Set the timer to the node's next deadline; never a busy loop."""
+        assert self._node is not None
+        deadline = self._node.next_deadline_ns()
+        if self._timer is not None:
+            if deadline == self._timer_due_ns:
+                return
+            self._timer.cancel()
+        wait_s = min(max(self._clock.wall_s(deadline - self._clock.now_ns()), 0.0005), 60.0)
+        self._timer_due_ns = deadline
+        self._timer = asyncio.get_running_loop().call_later(wait_s, self._on_timer)
+
+    def status(self) -> dict[str, Any]:
+        """What a person wants to know, as plain values."""
+        if self._node is None:
+            return {"robot": self.robot, "state": "waiting for the start"}
+        agent = self._node.agent
+        status: dict[str, Any] = {"robot": self.robot, **agent.status()}
+        status["peers"] = {peer.id: peer.up for peer in self._node.endpoint.peers()}
+        status["rejected"] = rejected(self._node)
+        status["lag_max_s"] = self._lag_ns * 1e-9
+        status["injected"] = self.config.injection is not None
+        if self._reader is not None:
+            status["autopilot"] = self._reader.status()
+        return status
+
+    def _figures(self) -> dict[str, Any]:
+        """What the launcher needs for the summary."""
+        assert self._node is not None and self._transport is not None
+        agent = self._node.agent
+        return {
+            "counters": dict(agent.counters),
+            "rejected": rejected(self._node),
+            "nis": {kind: [entry.total, entry.count] for kind, entry in agent.nis.items()},
+            "endpoint": dict(self._node.endpoint.counters),
+            "transport": dict(self._transport.counters),
+            "autopilot": dict(self._reader.counters) if self._reader is not None else {},
+            "lag_max_s": self._lag_ns * 1e-9,
+        }
+
+    # -- end ------------------------------------------------------------------------------------------------
+
+    async def _close(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        figures = self._figures() if self._node is not None else None
+        self._node = None
+        if self._mavlink is not None:
+            await self._mavlink.close()
+        if self._sensor_transport is not None:
+            self._sensor_transport.close()
+        (self._state_dir / "sensors.sock").unlink(missing_ok=True)
+        if self._recording is not None:
+            self._recording.close()
+        if self._fate_file is not None:
+            self._fate_file.close()
+        if self._control is not None:
+            if figures is not None:
+                self._control.say({"done": figures})
+            await self._control.close()
+        for opened in (self._feed, self._transport):
+            if opened is not None:
+                with contextlib.suppress(TimeoutError):
+                    await opened.close()
+
+
+FATE_COLUMNS = (
+    "source",
+    "destination",
+    "channel",
+    "incarnation",
+    "seq",
+    "t_send_ns",
+    "in_range",
+    "lost",
+    "delay_ns",
+    "duplicated",
+)
+
+
+def fate_row(record: FateRecord) -> list[Any]:
+    """A line of the fate log; columns as in FATE_COLUMNS."""
+    return [int(value) if isinstance(value, bool) else value for value in (getattr(record, n) for n in FATE_COLUMNS)]
+
+
+def estimate_bytes(estimate: Estimate) -> bytes:
+    """An estimate for the `estimate` key: msgpack, arrays as lists."""
+    data: bytes = msgpack.packb(
+        {
+            "t_ns": estimate.t_ns,
+            "model": estimate.model,
+            "mean": estimate.mean.tolist(),
+            "cov": estimate.cov.tolist(),
+            "tracks": {track.target: [track.mean.tolist(), track.cov.tolist()] for track in estimate.tracks},
+        }
+    )
+    return data

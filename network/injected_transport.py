@@ -1,0 +1,51 @@
+"""Link faults at the receiver, around a real transport: the same fates as in virtual time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+from network.links import LinkModel
+from network.messages import Packet
+from network.transport import OnPacket
+from network.wire import peek_header
+
+CallLater = Callable[[int, Callable[[], None]], object]
+"""Schedules a call after so many nanoseconds of fleet time."""
+
+
+class LinkInjector:
+    """Stands between a transport and its receiver `deliver`, and asks the link model about every packet.
+
+    A packet is delayed until its send stamp plus the drawn delay, so the transport's own latency counts in.
+    """
+
+    def __init__(
+        self, robot: str, links: LinkModel, now_ns: Callable[[], int], call_later: CallLater, deliver: OnPacket
+    ) -> None:
+        self._robot, self._links, self._now_ns = robot, links, now_ns
+        self._call_later, self._deliver = call_later, deliver
+        self.counters: Counter[str] = Counter()
+
+    def on_packet(self, packet: Packet) -> None:
+        """To be given to the transport as its receive callback."""
+        header = peek_header(packet.payload)
+        if header is None:
+            # Rubbish has no fate of its own; the endpoint counts it.
+            self._deliver(packet)
+            return
+        delays = self._links.decide(
+            source=packet.source,
+            destination=self._robot,
+            channel=packet.channel,
+            incarnation=header.incarnation,
+            seq=header.seq,
+            t_send_ns=header.t_send_ns,
+        )
+        self.counters["lost" if not delays else "delivered"] += 1
+        for delay in delays:
+            wait = header.t_send_ns + delay - self._now_ns()
+            if delay == 0 or wait <= 0:
+                self._deliver(packet)
+            else:
+                self._call_later(wait, lambda: self._deliver(packet))
