@@ -98,14 +98,20 @@ class Node:
         for effect in effects:
             match effect:
                 case Send(peer, t_meas_ns, body):
-                    try:
-                        out.packets.append(self.endpoint.send(event.t_ns, peer, t_meas_ns, body))
-                    except OversizeError:
-                        self.counters["send.oversize"] += 1
+                    self._transmit(lambda: self.endpoint.send(event.t_ns, peer, t_meas_ns, body), out)
                 case Broadcast(channel, t_meas_ns, body):
-                    out.packets.append(self.endpoint.broadcast(event.t_ns, channel, t_meas_ns, body))
+                    self._transmit(lambda: self.endpoint.broadcast(event.t_ns, channel, t_meas_ns, body), out)
                 case Publish(estimate):
                     out.estimates.append(estimate)
+
+    def _transmit(self, make: Callable[[], Packet], out: Outgoing) -> None:
+        """A message that cannot be told (too large, or degenerate numbers) is counted, never fatal."""
+        try:
+            out.packets.append(make())
+        except OversizeError:
+            self.counters["send.oversize"] += 1
+        except ValueError:
+            self.counters["send.degenerate"] += 1
 
 
 def _link_change(now_ns: int, change: PeerChange) -> LinkChange:

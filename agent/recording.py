@@ -14,14 +14,15 @@ from typing import Any, BinaryIO
 
 import msgpack
 import numpy as np
-from mcap.reader import make_reader
+from mcap.records import Channel, Message, Metadata
+from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from agent import effects as effect_types
 from agent import events as event_types
 from agent.config import AgentConfig
 from agent.core import Agent
-from agent.effects import Effect, Estimate, Publish
+from agent.effects import Effect
 from agent.events import Event
 from network import messages as message_types
 
@@ -83,7 +84,8 @@ class RecordingWriter:
 
     def __init__(self, path: Path) -> None:
         self._file: BinaryIO = path.open("wb")
-        self._writer = Writer(self._file, compression=CompressionType.NONE)
+        # Small chunks: a writer that is killed loses only the last one.
+        self._writer = Writer(self._file, chunk_size=1 << 16, compression=CompressionType.NONE)
         self._writer.start(profile="cofix", library="cofix")
         self._channels: dict[str, int] = {}
         self._sequence = 0
@@ -114,55 +116,51 @@ class RecordingWriter:
         self._file.close()
 
 
-def _open(path: Path) -> Any:
+def _records(path: Path, unfinished: bool) -> Iterator[Any]:
+    """Raw records of a file in order. Raises `RecordingError`; an unfinished file may be read up to its end."""
     try:
-        reader = make_reader(path.open("rb"))
-        if reader.get_summary() is None:
-            raise RecordingError(f"{path}: the recording was not finished; record it again")
-        return reader
+        with path.open("rb") as file:
+            yield from StreamReader(file).records
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file") from None
-    except RecordingError:
-        raise
     except Exception:
-        raise RecordingError(f"{path}: not a complete MCAP recording; record it again") from None
+        if not unfinished:
+            raise RecordingError(f"{path}: not a complete MCAP recording; record it again") from None
 
 
-def read_agents(path: Path) -> dict[str, tuple[AgentConfig, int]]:
+def read_agents(path: Path, unfinished: bool = False) -> dict[str, tuple[AgentConfig, int]]:
     """Configuration and start instant of every robot in a recording. Raises `RecordingError`."""
     agents = {}
-    for record in _open(path).iter_metadata():
-        if record.name.startswith("agent/"):
+    for record in _records(path, unfinished):
+        if isinstance(record, Metadata) and record.name.startswith("agent/"):
             config = AgentConfig.model_validate(json.loads(record.metadata["config"]))
             agents[record.name.removeprefix("agent/")] = (config, int(record.metadata["start_ns"]))
-    if not agents:
+    if not agents and not unfinished:
         raise RecordingError(f"{path}: holds no agent; it was not written by cofix")
     return agents
 
 
-def read_boundary(path: Path, robot: str) -> Iterator[tuple[Event, list[bytes]]]:
-    """Events of a robot in order, each with the packed effects that followed it."""
+def read_boundary(path: Path, robot: str, unfinished: bool = False) -> Iterator[tuple[Event, list[bytes]]]:
+    """Events of a robot in order, each with the packed effects that followed it.
+
+    `unfinished` accepts a file whose writer was killed and yields what is in it. Raises `RecordingError`.
+    """
+    topics: dict[int, str] = {}
     event: Event | None = None
     followed: list[bytes] = []
-    topics = [f"{robot}/events", f"{robot}/effects"]
-    for _, channel, message in _open(path).iter_messages(topics=topics, log_time_order=False):
-        if channel.topic.endswith("/events"):
-            if event is not None:
-                yield event, followed
-            event, followed = unpack(message.data), []
-        else:
-            followed.append(message.data)
+    for record in _records(path, unfinished):
+        if isinstance(record, Channel):
+            topics[record.id] = record.topic
+        elif isinstance(record, Message):
+            topic = topics.get(record.channel_id)
+            if topic == f"{robot}/events":
+                if event is not None:
+                    yield event, followed
+                event, followed = unpack(record.data), []
+            elif topic == f"{robot}/effects":
+                followed.append(record.data)
     if event is not None:
         yield event, followed
-
-
-def read_estimates(path: Path, robot: str) -> Iterator[Estimate]:
-    """All estimates a robot published, in order."""
-    for _, packed in read_boundary(path, robot):
-        for data in packed:
-            effect = unpack(data)
-            if isinstance(effect, Publish):
-                yield effect.estimate
 
 
 def replay(path: Path, robot: str) -> tuple[int, int, int | None]:
@@ -186,8 +184,10 @@ def merge(paths: dict[str, Path], target: Path) -> None:
     """Write the recordings of several robots into one file."""
     writer = RecordingWriter(target)
     for robot, path in paths.items():
-        config, start_ns = read_agents(path)[robot]
-        writer.add_robot(config, start_ns)
-        for event, packed in read_boundary(path, robot):
+        known = read_agents(path, unfinished=True).get(robot)
+        if known is None:
+            continue
+        writer.add_robot(*known)
+        for event, packed in read_boundary(path, robot, unfinished=True):
             writer.record(robot, event, [unpack(data) for data in packed])
     writer.close()

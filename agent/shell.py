@@ -328,7 +328,7 @@ FATE_COLUMNS = (
     "in_range",
     "lost",
     "delay_ns",
-    "duplicated",
+    "duplicate",
 )
 
 

@@ -1,0 +1,128 @@
+"""Figures of a run of processes: the agents' own recordings held against the truth afterwards."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from agent.recording import RecordingError, merge, read_boundary, unpack
+from agent.effects import Publish
+from agent.events import Received
+from agent.shell import FATE_COLUMNS
+from deploy.launch import Outcome
+from network.messages import PairReply, PairRequest
+from sim.bound import BoundRunner
+from sim.engine import Sampler, TrialResult, network_figures, sample_stride
+from sim.scenario import Scenario
+from sim.world import World
+
+# An estimate counts for a sampled instant if its own instant lies no further behind than so many steps.
+MAX_BEHIND_STEPS = 1.5
+AHEAD_STEPS = 0.3
+
+
+def collect(scenario: Scenario, world: World, run_dir: Path, outcome: Outcome, with_bound: bool) -> TrialResult:
+    """A `TrialResult` as the virtual engine gives it, from recordings and what the agents said at their end."""
+    sampler = Sampler(scenario, world, with_bound)
+    contacts: list[tuple[float, str, str]] = []
+    counters: dict[str, dict[str, int]] = {}
+    nis: dict[str, dict[str, tuple[float, int]]] = {}
+    rejected: Counter[str] = Counter()
+    traffic: Counter[str] = Counter()
+    for robot in world.robots:
+        path = run_dir / "agents" / f"{robot}.mcap"
+        _sample(sampler, world, robot, path, outcome.t0_ns, contacts)
+        figures: dict[str, Any] = outcome.figures.get(robot, {})
+        counters[robot] = figures.get("counters", {})
+        nis[robot] = {kind: (total, count) for kind, (total, count) in figures.get("nis", {}).items()}
+        rejected.update(figures.get("rejected", {}))
+        traffic["sent"] += figures.get("endpoint", {}).get("sent", 0)
+        traffic["bytes"] += figures.get("endpoint", {}).get("sent_bytes", 0)
+    for row in _fates(scenario, run_dir):
+        gone = row["in_range"] == "0" or row["lost"] == "1"
+        traffic["lost" if gone else "delivered"] += 1
+    if with_bound:
+        runner = BoundRunner(scenario, world)
+        for k in range(world.steps + 1):
+            if k:
+                runner.step(k, world.outputs(k))
+            row_index = sampler.row(k)
+            if row_index is not None:
+                for entity in (*world.robots, *world.targets):
+                    sampler.put_bound(entity, row_index, runner.belief(entity))
+    contacts.sort()
+    return TrialResult(
+        sampler.trace(),
+        contacts,
+        network_figures(traffic, counters),
+        dict(sorted(rejected.items())),
+        nis,
+        counters,
+    )
+
+
+def _sample(
+    sampler: Sampler, world: World, robot: str, path: Path, t0_ns: int, contacts: list[tuple[float, str, str]]
+) -> None:
+    """The last estimate published for each sampled instant, and the contacts the robot applied."""
+    stride_ns = sample_stride(world.step_ns) * world.step_ns
+    ahead, behind = AHEAD_STEPS * world.step_ns, MAX_BEHIND_STEPS * world.step_ns
+    latest = None
+    next_row = 0
+
+    def settle(until_ns: float) -> None:
+        """Fill the rows whose instant is over once an estimate for a later instant appears."""
+        nonlocal next_row
+        while latest is not None and next_row * stride_ns + ahead < until_ns and next_row * stride_ns <= span:
+            if next_row * stride_ns - (latest.t_ns - t0_ns) <= behind:
+                sampler.put(robot, robot, next_row, latest.mean, latest.cov)
+                for track in latest.tracks:
+                    sampler.put(robot, track.target, next_row, track.mean, track.cov)
+            next_row += 1
+
+    span = world.steps * world.step_ns
+    try:
+        for event, packed in read_boundary(path, robot, unfinished=True):
+            if isinstance(event, Received) and isinstance(event.message.body, PairRequest | PairReply):
+                contacts.append(((event.t_ns - t0_ns) * 1e-9, robot, event.message.header.source))
+            for data in packed:
+                effect = unpack(data)
+                if isinstance(effect, Publish):
+                    settle(effect.estimate.t_ns - t0_ns)
+                    latest = effect.estimate
+        if latest is not None:
+            settle(min(latest.t_ns - t0_ns + behind, span + 2 * ahead))
+    except RecordingError:
+        return
+
+
+def _fates(scenario: Scenario, run_dir: Path) -> list[dict[str, str]]:
+    rows: list[dict[str, str]] = []
+    for robot in scenario.robots:
+        path = run_dir / "agents" / f"{robot.id}.fates.csv"
+        if path.exists():
+            with path.open(newline="") as file:
+                rows += [dict(zip(FATE_COLUMNS, row)) for row in csv.reader(file) if len(row) == len(FATE_COLUMNS)]
+    return rows
+
+
+def merge_fates(scenario: Scenario, run_dir: Path) -> None:
+    """One `fates.csv` for the run, in place of one per receiver."""
+    rows = _fates(scenario, run_dir)
+    rows.sort(key=lambda row: (int(row["t_send_ns"]), row["source"], row["destination"], row["channel"], int(row["seq"])))
+    with (run_dir / "fates.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, FATE_COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)
+    for robot in scenario.robots:
+        (run_dir / "agents" / f"{robot.id}.fates.csv").unlink(missing_ok=True)
+
+
+def merge_recordings(scenario: Scenario, run_dir: Path) -> None:
+    """One `recording.mcap` for the run; an agent that was killed leaves what it had written."""
+    paths = {robot.id: run_dir / "agents" / f"{robot.id}.mcap" for robot in scenario.robots}
+    merge({robot: path for robot, path in paths.items() if path.exists()}, run_dir / "recording.mcap")
+    for path in paths.values():
+        path.unlink(missing_ok=True)

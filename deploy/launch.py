@@ -1,0 +1,337 @@
+"""Launches a run of real processes: the world with its autopilot stand-ins, and one process per agent.
+
+All wait at a barrier and start on one fleet clock. When something fails before the start, or the world fails, all
+are stopped and the reason is told; an agent that dies later is reported and the others go on. Everything started
+here is ended here, by its process id.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from agent.settings import NS
+from network.transport import free_port
+from network.zenoh_transport import link_pair
+from sim.agents import agent_tables, odometry_table, table
+from sim.host import HostPlan, plan_json
+from sim.scenario import RobotPart, Scenario, sensor_kind
+from sim.world import World
+
+READY_TIMEOUT_S = 30.0
+LEAD_S = 2.0
+STOP_TIMEOUT_S = 15.0
+WORLD = "world"
+
+# What the scheduling of one computer costs, in wall time: data of an instant are waited for so long, and stamps
+# that passed through TIMESYNC are off by so much.
+SETTLE_WALL_S = 0.015
+STAMP_WALL_S = 0.0015
+
+
+class LaunchError(RuntimeError):
+    """A run that could not start or had to be stopped; one line says why."""
+
+
+@dataclass(slots=True)
+class Member:
+    """One process of the run."""
+
+    name: str
+    process: asyncio.subprocess.Process
+    log: Path
+    writer: asyncio.StreamWriter | None = None
+    ready: bool = False
+    status: dict[str, Any] = field(default_factory=dict)
+    done: dict[str, Any] | None = None
+    exit_code: int | None = None
+    reaper: asyncio.Task[None] | None = None
+
+
+@dataclass(slots=True)
+class Outcome:
+    """How a run of processes ended."""
+
+    exits: dict[str, int]
+    figures: dict[str, dict[str, Any]]
+    world: dict[str, Any]
+    t0_ns: int
+    interrupted: bool
+    messages: list[str]
+
+
+def agent_file(
+    scenario: Scenario, world: World, robot: RobotPart, seed: int, speed: float, plan: HostPlan, run_dir: Path,
+    state_dir: Path, ports: dict[str, int],
+) -> dict[str, Any]:
+    """The file of one agent: what is common to all runtimes, plus endpoints, clock and injection."""
+    tables = agent_tables(scenario, world, robot)
+    endpoints = {name: list(link_pair("127.0.0.1", port)) for name, port in ports.items()}
+    lateness = tables["lateness"]
+    lateness["settle_s"] = max(lateness["settle_s"], SETTLE_WALL_S * speed)
+    lateness["tolerance_s"] = max(lateness["tolerance_s"], STAMP_WALL_S * speed)
+    pose = next((s for n, s in robot.sensors.items() if sensor_kind(n, s) == "pose"), None)
+    mavlink: dict[str, Any] = {
+        "endpoint": f"udpin:127.0.0.1:{plan.mavlink_ports[robot.id]}",
+        "simulated": True,
+        "odometry_source": "odometry",
+        "odometry": odometry_table(scenario, robot),
+        "rate_hz": 1.0 / scenario.step_s,
+    }
+    if pose is not None and "global_position" in robot.autopilot.sends:
+        mavlink |= {
+            "fixes": ["position", "heading"],
+            "fix_sigma_m": pose.sigma_m,
+            "fix_sigma_rad": pose.sigma_rad,
+            "fix_interval_s": 0.0,
+        }
+    return tables | {
+        "clock": {"source": "run", "speed": speed},
+        "lateness": lateness,
+        "zenoh": {
+            "listen": endpoints[robot.id],
+            "peers": [{"id": name, "endpoints": value} for name, value in endpoints.items() if name != robot.id],
+        },
+        "mavlink": mavlink,
+        "injection": {
+            "seed": seed,
+            "links": table(scenario.links),
+            "table": plan.link_endpoint,
+            "fate_log": str(run_dir / "agents" / f"{robot.id}.fates.csv"),
+        },
+        "state_dir": str(state_dir / robot.id),
+        "recording": str(run_dir / "agents" / f"{robot.id}.mcap"),
+        "control_socket": plan.control_socket,
+    }
+
+
+class Launcher:
+    """Starts, watches and ends the processes of one run."""
+
+    def __init__(self, scenario: Scenario, world: World, seed: int, speed: float, run_dir: Path) -> None:
+        self._scenario, self._world, self._seed, self._speed = scenario, world, seed, speed
+        self._run_dir = run_dir
+        self.members: dict[str, Member] = {}
+        self.messages: list[str] = []
+        self._changed = asyncio.Event()
+        self._interrupted = False
+        self._t0_ns = 0
+
+    async def run(self, show: Callable[[Launcher], None] | None = None) -> Outcome:
+        """Run to the end. Raises `LaunchError` when the run could not start or the world failed."""
+        # Sockets live in a short private path: their length is limited.
+        private = Path(tempfile.mkdtemp(prefix="cofix-"))
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, self._interrupt)
+        server = None
+        try:
+            plan = self._write_files(private)
+            server = await asyncio.start_unix_server(self._serve, path=plan.control_socket, limit=2**22)
+            await self._start(private)
+            await self._barrier()
+            await self._watch(show)
+        finally:
+            await self._end()
+            if server is not None:
+                server.close()
+            for number in (signal.SIGINT, signal.SIGTERM):
+                loop.remove_signal_handler(number)
+            shutil.rmtree(private, ignore_errors=True)
+        return self._outcome()
+
+    def progress(self) -> float:
+        """Share of the run that is played, in [0, 1]."""
+        world = self.members.get(WORLD)
+        return float(world.status.get("progress", 0.0)) if world is not None else 0.0
+
+    # -- start ----------------------------------------------------------------------------------------------
+
+    def _write_files(self, private: Path) -> HostPlan:
+        robots = [robot.id for robot in self._scenario.robots]
+        taken: list[int] = []
+
+        def port() -> int:
+            taken.append(free_port(exclude=taken))
+            return taken[-1]
+
+        ports = {name: port() for name in robots}
+        plan = HostPlan(
+            scenario=str(self._run_dir / "scenario.toml"),
+            seed=self._seed,
+            speed=self._speed,
+            control_socket=str(private / "control.sock"),
+            link_endpoint=f"tcp/127.0.0.1:{port()}",
+            mavlink_ports={name: port() for name in robots},
+            sensor_sockets={name: str(private / name / "sensors.sock") for name in robots},
+        )
+        (private / "plan.json").write_text(plan_json(plan))
+        agents = self._run_dir / "agents"
+        agents.mkdir(exist_ok=True)
+        (self._run_dir / "logs").mkdir(exist_ok=True)
+        for robot in self._scenario.robots:
+            tables = agent_file(
+                self._scenario, self._world, robot, self._seed, self._speed, plan, self._run_dir, private, ports
+            )
+            with (agents / f"{robot.id}.toml").open("wb") as file:
+                tomli_w.dump(tables, file)
+        return plan
+
+    async def _start(self, private: Path) -> None:
+        await self._spawn(WORLD, "-m", "sim.host", str(private / "plan.json"))
+        for robot in self._scenario.robots:
+            config = self._run_dir / "agents" / f"{robot.id}.toml"
+            await self._spawn(robot.id, "-m", "deploy.cli", "agent", str(config))
+
+    async def _spawn(self, name: str, *arguments: str) -> None:
+        log = self._run_dir / "logs" / f"{name}.log"
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+        with log.open("wb") as output:
+            process = await asyncio.create_subprocess_exec(
+                sys.executable,
+                "-P",
+                *arguments,
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                env=environment,
+                start_new_session=True,
+            )
+        member = Member(name, process, log)
+        self.members[name] = member
+        member.reaper = asyncio.create_task(self._reap(member))
+
+    async def _reap(self, member: Member) -> None:
+        member.exit_code = await member.process.wait()
+        self._changed.set()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        name = None
+        with contextlib.suppress(OSError, ValueError, asyncio.IncompleteReadError):
+            while line := await reader.readline():
+                message = json.loads(line)
+                name = message.get("hello", name)
+                member = self.members.get(name) if name is not None else None
+                if member is None:
+                    continue
+                member.writer = writer
+                member.ready = member.ready or "ready" in message
+                if "status" in message:
+                    member.status = message["status"]
+                if "done" in message:
+                    member.done = message["done"]
+                self._changed.set()
+
+    async def _barrier(self) -> None:
+        deadline = time.monotonic() + READY_TIMEOUT_S
+        while not all(member.ready for member in self.members.values()):
+            for member in self.members.values():
+                if member.exit_code is not None:
+                    raise LaunchError(f"{member.name} ended before the start: {last_line(member.log)}")
+            if self._interrupted:
+                raise LaunchError("interrupted before the start")
+            if time.monotonic() > deadline:
+                late = ", ".join(m.name for m in self.members.values() if not m.ready)
+                raise LaunchError(f"{late} not ready after {READY_TIMEOUT_S:.0f} s; see {self._run_dir / 'logs'}")
+            await self._wait(0.2)
+        self._t0_ns = time.time_ns() // NS * NS
+        begin = {"t0_ns": self._t0_ns, "monotonic0_ns": time.monotonic_ns() + int(LEAD_S * NS)}
+        for member in self.members.values():
+            self._tell(member, {"start": begin})
+
+    # -- work and end ---------------------------------------------------------------------------------------
+
+    async def _watch(self, show: Callable[[Launcher], None] | None) -> None:
+        world = self.members[WORLD]
+        reported: list[str] = []
+        while world.done is None and not self._interrupted:
+            if world.exit_code is not None:
+                raise LaunchError(f"the world {describe_exit(world.exit_code)}: {last_line(world.log)}")
+            for member in self.members.values():
+                if member.exit_code is not None and member.name not in reported:
+                    reported.append(member.name)
+                    at = self.progress() * self._scenario.duration_s
+                    reason = last_line(member.log)
+                    told = f": {reason}" if reason else ""
+                    self.messages.append(
+                        f"{member.name} {describe_exit(member.exit_code)} at about {at:.0f} s{told}; the others go on"
+                    )
+            if show is not None:
+                show(self)
+            await self._wait(0.25)
+        if show is not None:
+            show(self)
+
+    async def _wait(self, seconds: float) -> None:
+        self._changed.clear()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._changed.wait(), seconds)
+
+    def _interrupt(self) -> None:
+        self._interrupted = True
+        self._changed.set()
+
+    def _tell(self, member: Member, message: dict[str, Any]) -> None:
+        if member.writer is not None and not member.writer.is_closing():
+            member.writer.write(json.dumps(message).encode() + b"\n")
+
+    async def _end(self) -> None:
+        """Stop what still runs: a word, then SIGTERM, then SIGKILL; by process id."""
+        order = [m for m in self.members.values() if m.name != WORLD] + [
+            m for m in self.members.values() if m.name == WORLD
+        ]
+        for member in order:
+            self._tell(member, {"stop": True})
+        await self._all_gone(STOP_TIMEOUT_S)
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            for member in order:
+                if member.exit_code is None:
+                    with contextlib.suppress(ProcessLookupError):
+                        member.process.send_signal(number)
+            await self._all_gone(3.0)
+        for member in order:
+            if member.reaper is not None:
+                await member.reaper
+
+    async def _all_gone(self, seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        while any(m.exit_code is None for m in self.members.values()) and time.monotonic() < deadline:
+            await self._wait(0.1)
+
+    def _outcome(self) -> Outcome:
+        exits = {n: m.exit_code if m.exit_code is not None else -1 for n, m in self.members.items() if n != WORLD}
+        figures = {name: m.done for name, m in self.members.items() if m.done is not None and name != WORLD}
+        world = self.members[WORLD].done or {}
+        return Outcome(exits, figures, world, self._t0_ns, self._interrupted, self.messages)
+
+
+def describe_exit(code: int) -> str:
+    """What an exit code says, in words."""
+    if code < 0:
+        try:
+            return f"was ended by {signal.Signals(-code).name}"
+        except ValueError:
+            return f"was ended by signal {-code}"
+    return f"ended with exit status {code}"
+
+
+def last_line(log: Path) -> str:
+    """The last thing a process said."""
+    try:
+        lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    except OSError:
+        return ""
+    return lines[-1].strip() if lines else ""

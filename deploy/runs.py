@@ -1,0 +1,226 @@
+"""Carries out `cofix run` and `cofix montecarlo`: run directory, progress, figures, report, exit status."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import csv
+import json
+import shlex
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from agent.config import AgentConfig, ConfigError
+from agent.node import Recorder
+from agent.recording import RecordingWriter
+from agent.shell import FATE_COLUMNS, fate_row
+from deploy.evaluate import collect, merge_fates, merge_recordings
+from deploy.launch import LaunchError, Launcher
+from deploy.status import LiveTable, Progress, print_summary
+from network.links import FateRecord
+from sim.agents import agent_config, table
+from sim.engine import TrialResult
+from sim.metrics import trial_figures
+from sim.montecarlo import run_trials, write_trials
+from sim.scenario import Scenario, load
+from sim.store import load_trace, save_trace
+from sim.summary import reduce, summarize, unmet
+from sim.trial import open_world, run_trial
+
+DEMO = "demo"
+
+
+def run(options: argparse.Namespace) -> int:
+    """`cofix run`."""
+    name = options.scenario or DEMO
+    scenario = _load(name, options)
+    runtime = options.runtime or ("processes" if name == DEMO else "virtual")
+    if runtime == "virtual" and options.speed != 1.0:
+        raise ConfigError("--speed is for --runtime processes; virtual time runs as fast as it can")
+    speed = options.speed if name != DEMO or options.speed != 1.0 else DEMO_SPEED
+    world = open_world(scenario, options.seed)
+    run_dir = _run_dir(options.out, scenario.name)
+    _write_scenario(scenario, run_dir)
+    started = time.perf_counter()
+    exits: dict[str, int] | None = None
+    messages: list[str] = []
+    lag_max_s = 0.0
+    if runtime == "virtual":
+        result = _run_virtual(scenario, options, world, run_dir)
+    else:
+        launcher = Launcher(scenario, world, options.seed, speed, run_dir)
+        live = LiveTable(scenario, speed, quiet=options.json)
+        try:
+            with live:
+                outcome = asyncio.run(launcher.run(live.show))
+        except LaunchError as error:
+            print(f"cofix: {error}", file=sys.stderr)
+            return 1
+        if outcome.interrupted:
+            print("cofix: interrupted; all processes are stopped", file=sys.stderr)
+            return 1
+        exits, messages = outcome.exits, outcome.messages
+        lag_max_s = max([f["lag_max_s"] for f in (*outcome.figures.values(), outcome.world) if f], default=0.0)
+        result = collect(scenario, world, run_dir, outcome, options.bound)
+        merge_recordings(scenario, run_dir)
+        merge_fates(scenario, run_dir)
+    steps = sorted(result.step_us)
+    timing = {
+        "wall_s": time.perf_counter() - started,
+        "lag_max_s": lag_max_s,
+        "step_us_median": steps[len(steps) // 2] if steps else 0.0,
+    }
+    summary = summarize(
+        scenario,
+        runtime,
+        options.seed,
+        [reduce(scenario, result)],
+        simulated_s=world.steps * world.step_ns * 1e-9,
+        timing=timing,
+        exits=exits,
+    )
+    save_trace(run_dir, result.trace, result.contacts, world.landmarks)
+    _finish(scenario, run_dir, summary, options)
+    for message in messages:
+        print(f"cofix: {message}", file=sys.stderr)
+    return _status(scenario, summary)
+
+
+DEMO_SPEED = 10.0
+
+
+def montecarlo(options: argparse.Namespace) -> int:
+    """`cofix montecarlo`."""
+    scenario = _load(options.scenario, options)
+    world = open_world(scenario, options.seed)
+    run_dir = _run_dir(options.out, scenario.name)
+    _write_scenario(scenario, run_dir)
+    started = time.perf_counter()
+    with Progress(f"{scenario.name}: trials", quiet=False) as progress:
+        reduced = run_trials(
+            scenario, options.trials, options.jobs, options.seed, options.bound, progress.update
+        )
+    summary = summarize(
+        scenario,
+        "virtual",
+        options.seed,
+        reduced,
+        simulated_s=world.steps * world.step_ns * 1e-9,
+        timing={"wall_s": time.perf_counter() - started},
+    )
+    per_trial = [trial_figures(item["figures"]) for item in reduced]
+    write_trials(run_dir / "trials.csv", options.seed, per_trial)
+    _finish(scenario, run_dir, summary, options)
+    return _status(scenario, summary)
+
+
+def rewrite_report(run_dir: Path) -> Path:
+    """`cofix report`. Raises `ConfigError` when the directory holds no run."""
+    try:
+        summary = json.loads((run_dir / "summary.json").read_text())
+    except (OSError, ValueError):
+        raise ConfigError(f"{run_dir}: no readable summary.json; name the directory of a finished run") from None
+    return _report(run_dir, summary)
+
+
+def _load(name: str, options: argparse.Namespace) -> Scenario:
+    overrides = list(options.set)
+    if options.duration is not None:
+        overrides.append(f"duration_s={float(options.duration)!r}")
+    scenario = load(name, overrides)
+    return scenario
+
+
+def _run_dir(out: Path | None, name: str) -> Path:
+    run_dir = out if out is not None else Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    try:
+        if run_dir.exists() and any(run_dir.iterdir()):
+            raise ConfigError(f"--out {run_dir}: not empty; name a new directory")
+        run_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out {run_dir}: cannot be written ({error.strerror})") from None
+    return run_dir.resolve()
+
+
+def _write_scenario(scenario: Scenario, run_dir: Path) -> None:
+    with (run_dir / "scenario.toml").open("wb") as file:
+        tomli_w.dump(table(scenario), file)
+
+
+def _run_virtual(scenario: Scenario, options: argparse.Namespace, world: Any, run_dir: Path) -> TrialResult:
+    configs: dict[str, AgentConfig] = {
+        robot.id: agent_config(scenario, world, robot) for robot in scenario.robots
+    }
+    writer = RecordingWriter(run_dir / "recording.mcap")
+    (run_dir / "agents").mkdir(exist_ok=True)
+    for robot, config in configs.items():
+        writer.add_robot(config, 0)
+        with (run_dir / "agents" / f"{robot}.toml").open("wb") as file:
+            tomli_w.dump(table(config), file)
+
+    def recorder(robot: str) -> Recorder:
+        return lambda event, effects: writer.record(robot, event, effects)
+
+    with (run_dir / "fates.csv").open("w", newline="") as file, Progress(scenario.name, options.json) as progress:
+        fates = csv.writer(file)
+        fates.writerow(FATE_COLUMNS)
+
+        def log_fate(record: FateRecord) -> None:
+            fates.writerow(fate_row(record))
+
+        result = run_trial(
+            scenario,
+            options.seed,
+            with_bound=options.bound,
+            recorders={robot: recorder(robot) for robot in configs},
+            fate_sink=log_fate,
+            progress=progress.update,
+            world=world,
+        )
+    writer.close()
+    return result
+
+
+def _finish(scenario: Scenario, run_dir: Path, summary: dict[str, Any], options: argparse.Namespace) -> None:
+    (run_dir / "command.txt").write_text(shlex.join(["cofix", *sys.argv[1:]]) + "\n")
+    temporary = run_dir / "summary.tmp"
+    temporary.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    temporary.replace(run_dir / "summary.json")
+    report: Path | None
+    try:
+        report = _report(run_dir, summary)
+    except ConfigError as error:
+        print(f"cofix: no report: {error}", file=sys.stderr)
+        report = None
+    if options.json:
+        print(json.dumps(summary, allow_nan=False))
+    else:
+        print_summary(summary, run_dir, report)
+    for line in unmet(summary, scenario.expect):
+        print(f"cofix: expectation not met: {line}", file=sys.stderr)
+
+
+def _report(run_dir: Path, summary: dict[str, Any]) -> Path:
+    from sim.report import ReportUnavailable, write_report
+
+    stored = load_trace(run_dir)
+    try:
+        return write_report(
+            run_dir,
+            summary,
+            stored.trace if stored is not None else None,
+            stored.contacts if stored is not None else None,
+            stored.landmarks if stored is not None else {},
+            summary["scenario"],
+        )
+    except ReportUnavailable as error:
+        raise ConfigError(str(error)) from None
+
+
+def _status(scenario: Scenario, summary: dict[str, Any]) -> int:
+    died = any(code != 0 for code in summary["exit"].values())
+    return 1 if died or unmet(summary, scenario.expect) else 0

@@ -1,0 +1,165 @@
+"""What a person sees in the terminal: progress, the live table of a run, the summary at its end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+from rich.table import Table
+
+from sim.scenario import Scenario
+
+if TYPE_CHECKING:
+    from deploy.launch import Launcher
+
+
+class Progress:
+    """A bar with the time left, on standard error; `quiet` shows nothing."""
+
+    def __init__(self, title: str, quiet: bool) -> None:
+        self._bar = Bar(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            disable=quiet,
+            transient=True,
+        )
+        self._task = self._bar.add_task(title, total=None)
+
+    def update(self, done: int, total: int) -> None:
+        self._bar.update(self._task, completed=done, total=total)
+
+    def __enter__(self) -> Progress:
+        self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        self._bar.stop()
+
+
+class LiveTable:
+    """One row per agent while a run of processes goes on."""
+
+    def __init__(self, scenario: Scenario, speed: float, quiet: bool) -> None:
+        self._scenario, self._speed = scenario, speed
+        self._live = None if quiet else Live(console=Console(stderr=True), refresh_per_second=4, transient=True)
+
+    def __enter__(self) -> LiveTable:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def show(self, launcher: Launcher) -> None:
+        """Draw the present state."""
+        if self._live is not None:
+            self._live.update(self.table(launcher))
+
+    def table(self, launcher: Launcher) -> Table:
+        """The present state as a table."""
+        played = launcher.progress() * self._scenario.duration_s
+        title = f"{self._scenario.name}  {played:.0f} / {self._scenario.duration_s:.0f} s  at {self._speed:g} x"
+        table = Table(title=title, title_justify="left")
+        for name in ("agent", "process", "x [m]", "y [m]", "sigma [m]", "neighbours", "contacts", "rejected", "lag [s]"):
+            table.add_column(name, justify="left" if name in ("agent", "process", "neighbours") else "right")
+        for robot in self._scenario.robots:
+            member = launcher.members.get(robot.id)
+            if member is None:
+                continue
+            table.add_row(robot.id, *_cells(member.exit_code, member.status))
+        return table
+
+
+def _cells(exit_code: int | None, status: dict[str, Any]) -> list[str]:
+    if exit_code is not None:
+        return [f"[red]ended ({exit_code})[/red]"] + [""] * 7
+    if "x_m" not in status:
+        return ["starting"] + [""] * 7
+    counters = status.get("counters", {})
+    contacts = counters.get("pair.applied_initiator", 0) + counters.get("pair.applied_responder", 0)
+    peers = " ".join(peer for peer, up in sorted(status.get("peers", {}).items()) if up)
+    return [
+        "running" + (" (faults injected)" if status.get("injected") else ""),
+        f"{status['x_m']:.2f}",
+        f"{status['y_m']:.2f}",
+        f"{status['sigma_m']:.2f}",
+        peers or "none heard",
+        str(contacts),
+        str(sum(status.get("rejected", {}).values())),
+        f"{status['lag_s']:.2f}",
+    ]
+
+
+def print_summary(summary: dict[str, Any], run_dir: Path, report: Path | None) -> None:
+    """The figures a person asks for first, on standard output."""
+    console = Console()
+    trials = summary["trials"]
+    head = f"{summary['scenario']}, {summary['runtime']}, seed {summary['seed']}"
+    if trials > 1:
+        head += f", {trials} trials, {summary['lost']} lost"
+    table = Table(title=head, title_justify="left")
+    columns = ("robot", "position RMSE [m]", "max [m]", "heading RMSE [rad]", "ANEES (ideal 1)", "in 3 sigma")
+    for name in columns:
+        table.add_column(name, justify="left" if name == "robot" else "right")
+    for robot, entry in summary["robots"].items():
+        table.add_row(
+            robot,
+            _number(entry["position_rmse_m"], 3),
+            _number(entry["position_error_max_m"], 2),
+            _number(entry.get("heading_rmse_rad"), 3),
+            _number(entry["anees"], 2),
+            _number(entry["containment_3sigma"], 3),
+        )
+    fleet = summary["fleet"]
+    table.add_section()
+    table.add_row(
+        "fleet",
+        _number(fleet["position_rmse_m"], 3),
+        "",
+        _number(fleet.get("heading_rmse_rad"), 3),
+        _number(fleet["anees"], 2),
+        "",
+    )
+    bound = summary.get("bound")
+    if bound:
+        table.add_row(
+            "centralized bound",
+            _number(bound["position_rmse_m"], 3),
+            "",
+            _number(bound.get("heading_rmse_rad"), 3),
+            _number(bound["anees"], 2),
+            "",
+        )
+    console.print(table)
+    if fleet.get("target_position_rmse_m") is not None:
+        console.print(
+            f"targets: position RMSE {_number(fleet['target_position_rmse_m'], 3)} m, "
+            f"ANEES {_number(fleet.get('target_anees'), 2)}"
+        )
+    network = summary["network"]
+    pair = network["pair"]
+    console.print(
+        f"network: {network['sent']} messages, {network['bytes_per_robot_s']:.0f} B/s and robot, "
+        f"{pair['completed']} of {pair['started']} contacts completed, {pair['one_sided']} one-sided"
+    )
+    if summary["rejected"]:
+        console.print("rejected: " + ", ".join(f"{name} {count}" for name, count in summary["rejected"].items()))
+    if summary["faults"]:
+        console.print("injected: " + ", ".join(summary["faults"]))
+    if report is not None:
+        console.print(f"report: {report}", soft_wrap=True)
+    console.print(f"run directory: {run_dir}", soft_wrap=True)
+
+
+def _number(value: Any, digits: int) -> str:
+    return f"{value:.{digits}f}" if isinstance(value, (int, float)) else "-"

@@ -1,0 +1,195 @@
+"""The world as a process of a run: truth, sensors, autopilot stand-ins and the table of who hears whom.
+
+Started by the launcher as `python -P -m sim.host PLAN`; it speaks to the agents exactly as the field would: MAVLink
+to each autopilot link, datagrams to each sensor socket.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import socket
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agent.control import ControlLine
+from agent.fleet_clock import FleetClock
+from agent.sensor_input import encode
+from network.link_feed import LinkFeed
+from sim.autopilot import StandIn, StandInServer, StandInSettings
+from sim.reach import Reach
+from sim.scenario import RobotPart, load
+from sim.trial import open_world
+from sim.world import Output, World
+
+BOOT_LEAD_NS = 30_000_000_000
+FINAL_WALL_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class HostPlan:
+    """What the launcher tells the world; stored as JSON."""
+
+    scenario: str
+    seed: int
+    speed: float
+    control_socket: str
+    link_endpoint: str
+    mavlink_ports: dict[str, int]
+    sensor_sockets: dict[str, str]
+
+    @staticmethod
+    def read(path: Path) -> HostPlan:
+        return HostPlan(**json.loads(path.read_text()))
+
+
+class WorldHost:
+    """Plays a world in fleet time."""
+
+    def __init__(self, plan: HostPlan) -> None:
+        self._plan = plan
+        self._scenario = load(plan.scenario)
+        self._world: World = open_world(self._scenario, plan.seed)
+        links = self._scenario.links
+        self._reach = None if links.range_m is None else Reach(self._world, links.range_m, links.hysteresis_m)
+        self._feed = LinkFeed()
+        self._parts: dict[str, RobotPart] = {robot.id: robot for robot in self._scenario.robots}
+        self._servers: dict[str, StandInServer] = {}
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._undelivered = 0
+        self._lag_ns = 0
+
+    async def run(self) -> None:
+        control = ControlLine("world")
+        await control.connect(self._plan.control_socket)
+        await self._feed.serve(self._plan.link_endpoint)
+        control.say({"ready": "world"})
+        stop = asyncio.ensure_future(control.stopped.wait())
+        try:
+            assert control.started is not None
+            begin = await control.started
+            clock = FleetClock(begin["t0_ns"], begin["monotonic0_ns"], self._plan.speed)
+            await self._start_vehicles(clock)
+            play = asyncio.ensure_future(self._play(clock, control))
+            await asyncio.wait({play, stop}, return_when=asyncio.FIRST_COMPLETED)
+            if play.done():
+                play.result()
+                control.say({"done": {"undelivered": self._undelivered, "lag_max_s": self._lag_ns * 1e-9}})
+                await stop
+            else:
+                play.cancel()
+                with contextlib.suppress(asyncio.CancelledError):
+                    await play
+        except asyncio.CancelledError:
+            pass
+        finally:
+            stop.cancel()
+            for server in self._servers.values():
+                await server.close()
+            self._socket.close()
+            await control.close()
+            with contextlib.suppress(TimeoutError):
+                await self._feed.close()
+
+    async def _start_vehicles(self, clock: FleetClock) -> None:
+        for index, (robot, port) in enumerate(sorted(self._plan.mavlink_ports.items())):
+            part = self._parts[robot]
+            settings = StandInSettings(
+                system_id=index + 1,
+                flavour=part.autopilot.flavour,
+                sends=tuple(part.autopilot.sends),
+                origin=(self._scenario.origin[0], self._scenario.origin[1], self._scenario.origin[2]),
+                boot_ns=clock.t0_ns - BOOT_LEAD_NS,
+            )
+            server = StandInServer(StandIn(settings), f"udpout:127.0.0.1:{port}", clock)
+            await server.start()
+            self._servers[robot] = server
+
+    async def _play(self, clock: FleetClock, control: ControlLine) -> None:
+        world = self._world
+        await self._until(clock, clock.t0_ns)
+        self._publish_reach(0, clock.t0_ns)
+        for robot, server in self._servers.items():
+            server.stand_in.set_odometry(clock.t0_ns, np.zeros(4))
+            self._place(robot, 0, clock.t0_ns)
+            server.push(clock.t0_ns)
+        for k in range(1, world.steps + 1):
+            end = k * world.step_ns
+            groups: dict[int, list[Output]] = {}
+            for item in world.outputs(k):
+                groups.setdefault(item.t_ns, []).append(item)
+            for t_ns, items in sorted(groups.items()):
+                await self._until(clock, clock.t0_ns + t_ns)
+                if t_ns == end:
+                    self._publish_reach(k, clock.t0_ns + end)
+                self._emit(k, clock.t0_ns + t_ns, items)
+            if k % 10 == 0:
+                control.say({"status": {"progress": k / world.steps}})
+        # The last instant settles and its exchanges end before the agents are stopped.
+        await asyncio.sleep(FINAL_WALL_S + clock.wall_s(2 * world.step_ns) / 2)
+
+    async def _until(self, clock: FleetClock, t_ns: int) -> None:
+        wait_s = clock.wall_s(t_ns - clock.now_ns())
+        if wait_s > 0.0:
+            await asyncio.sleep(wait_s)
+        self._lag_ns = max(self._lag_ns, clock.now_ns() - t_ns)
+
+    def _publish_reach(self, k: int, t_ns: int) -> None:
+        if self._reach is not None:
+            self._feed.publish(t_ns, self._world.robots, self._reach.at(k))
+
+    def _place(self, robot: str, k: int, t_ns: int) -> None:
+        x, y, heading = self._world.truth(robot, k)[:3]
+        self._servers[robot].stand_in.set_state(t_ns, x, y, 0.0, heading, 0.0, 0.0, 0.0, 0.0)
+
+    def _emit(self, k: int, t_ns: int, items: list[Output]) -> None:
+        """Odometry and fixes by MAVLink, all else to the sensor sockets."""
+        moved = []
+        for item in items:
+            part = self._parts[item.robot]
+            stand_in = self._servers[item.robot].stand_in
+            if item.kind == "odometry":
+                stand_in.set_odometry(t_ns, item.z)
+                moved.append(item.robot)
+            elif item.kind == "pose" and "global_position" in part.autopilot.sends:
+                stand_in.set_fix(t_ns, item.z[0], item.z[1], 0.0, item.z[2])
+            else:
+                self._send_sensor(item, t_ns)
+        for robot in moved:
+            self._place(robot, k, t_ns)
+            self._servers[robot].push(t_ns)
+
+    def _send_sensor(self, item: Output, t_ns: int) -> None:
+        payload = encode(t_ns, item.kind, item.z, item.R, of=item.of, sensor=item.sensor)
+        try:
+            self._socket.sendto(payload, self._plan.sensor_sockets[item.robot])
+        except OSError:
+            # A dead or overloaded agent loses the datagram, as a driver's would be lost.
+            self._undelivered += 1
+
+
+def main(arguments: list[str]) -> int:
+    """Entry point of the process: one argument, the plan's path."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    plan = HostPlan.read(Path(arguments[0]))
+    asyncio.run(WorldHost(plan).run())
+    return 0
+
+
+def plan_json(plan: HostPlan) -> str:
+    """The plan as stored."""
+    values: dict[str, Any] = {name: getattr(plan, name) for name in HostPlan.__slots__}
+    return json.dumps(values, indent=1)
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,78 @@
+"""What a report is made from, kept in the run directory as `trace.npz`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.metrics import StateTrace, TrialTrace
+
+FILE = "trace.npz"
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """A trial's samples with the contacts (time [s], robot, peer) and landmarks."""
+
+    trace: TrialTrace
+    contacts: list[tuple[float, str, str]]
+    landmarks: dict[str, tuple[float, float]]
+
+
+def save_trace(
+    run_dir: Path,
+    trace: TrialTrace,
+    contacts: list[tuple[float, str, str]],
+    landmarks: dict[str, tuple[float, float]],
+) -> None:
+    """Write `trace.npz`."""
+    arrays: dict[str, Any] = {"t_s": trace.t_s}
+    index: list[dict[str, Any]] = []
+
+    def add(group: str, names: list[str], state: StateTrace) -> None:
+        key = str(len(index))
+        index.append({"group": group, "names": names, "angles": list(state.angles)})
+        arrays[f"{key}.truth"], arrays[f"{key}.mean"], arrays[f"{key}.cov"] = state.truth, state.mean, state.cov
+
+    for name, state in trace.robots.items():
+        add("robots", [name], state)
+    for target, owners in trace.targets.items():
+        for owner, state in owners.items():
+            add("targets", [target, owner], state)
+    for group, states in (trace.bound or {}).items():
+        for name, state in states.items():
+            add(f"bound.{group}", [name], state)
+    meta = {"index": index, "contacts": contacts, "landmarks": landmarks, "bound": trace.bound is not None}
+    np.savez_compressed(run_dir / FILE, meta=np.array(json.dumps(meta)), **arrays)
+
+
+def load_trace(run_dir: Path) -> Stored | None:
+    """Read `trace.npz`; None when the run has none (many trials keep no samples)."""
+    path = run_dir / FILE
+    if not path.exists():
+        return None
+    with np.load(path, allow_pickle=False) as data:
+        meta = json.loads(str(data["meta"]))
+        robots: dict[str, StateTrace] = {}
+        targets: dict[str, dict[str, StateTrace]] = {}
+        bound: dict[str, dict[str, StateTrace]] = {"robots": {}, "targets": {}}
+        for key, entry in enumerate(meta["index"]):
+            state = StateTrace(
+                data[f"{key}.truth"], data[f"{key}.mean"], data[f"{key}.cov"], tuple(entry["angles"])
+            )
+            names = entry["names"]
+            if entry["group"] == "robots":
+                robots[names[0]] = state
+            elif entry["group"] == "targets":
+                targets.setdefault(names[0], {})[names[1]] = state
+            else:
+                bound[entry["group"].removeprefix("bound.")][names[0]] = state
+        trace = TrialTrace(
+            t_s=data["t_s"], robots=robots, targets=targets, bound=bound if meta["bound"] else None
+        )
+    contacts = [(float(t), str(a), str(b)) for t, a, b in meta["contacts"]]
+    return Stored(trace, contacts, {name: (float(x), float(y)) for name, (x, y) in meta["landmarks"].items()})

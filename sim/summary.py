@@ -1,0 +1,112 @@
+"""`summary.json`: the figures of a run, schema 1."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from sim.engine import TrialResult
+from sim.metrics import combine, reduce_trial
+from sim.scenario import BoundPart, Scenario
+
+SCHEMA = 1
+NOT_COMPARED = "timing"
+"""The key left out when two summaries are compared for equality."""
+
+
+def reduce(scenario: Scenario, result: TrialResult) -> dict[str, Any]:
+    """The small part of a trial that a summary needs; what a worker process sends back."""
+    return {
+        "figures": reduce_trial(result.trace, tuple(scenario.window_s)),
+        "network": result.network,
+        "rejected": result.rejected,
+        "nis": result.nis,
+        "repairs": sum(own.get("update.not_positive_definite", 0) for own in result.counters.values()),
+        "step_us": result.step_us,
+    }
+
+
+def summarize(
+    scenario: Scenario,
+    runtime: str,
+    seed: int,
+    reduced: list[dict[str, Any]],
+    *,
+    simulated_s: float,
+    timing: dict[str, float],
+    exits: dict[str, int] | None = None,
+) -> dict[str, Any]:
+    """The whole summary, from the reduced trials in order."""
+    figures = combine(
+        [item["figures"] for item in reduced], tuple(scenario.window_s), scenario.lost_above_m
+    )
+    for robot, entry in figures["robots"].items():
+        entry["nis"] = _nis([item["nis"].get(robot, {}) for item in reduced])
+    network: Counter[str] = Counter()
+    pair: Counter[str] = Counter()
+    rejected: Counter[str] = Counter()
+    for item in reduced:
+        network.update({key: value for key, value in item["network"].items() if key != "pair"})
+        pair.update(item["network"]["pair"])
+        rejected.update(item["rejected"])
+    seconds = simulated_s * len(reduced) * len(scenario.robots)
+    lost = figures.pop("lost")
+    return {
+        "schema": SCHEMA,
+        "scenario": scenario.name,
+        "runtime": runtime,
+        "seed": seed,
+        "trials": len(reduced),
+        "lost": lost,
+        "window_s": list(scenario.window_s),
+        "simulated_s": simulated_s,
+        **figures,
+        "network": {
+            **{key: network[key] for key in ("sent", "delivered", "lost", "bytes")},
+            "bytes_per_robot_s": network["bytes"] / seconds if seconds else 0.0,
+            "pair": {key: pair[key] for key in ("started", "completed", "one_sided", "fallback", "too_old")},
+        },
+        "rejected": dict(sorted(rejected.items())),
+        "covariance_repairs": sum(item["repairs"] for item in reduced),
+        "faults": faults(scenario),
+        "exit": exits if exits is not None else {robot.id: 0 for robot in scenario.robots},
+        "timing": timing,
+    }
+
+
+def _nis(trials: list[dict[str, tuple[float, int]]]) -> dict[str, float]:
+    total: Counter[str] = Counter()
+    count: Counter[str] = Counter()
+    for trial in trials:
+        for kind, (value, number) in trial.items():
+            total[kind] += value  # type: ignore[assignment]
+            count[kind] += number
+    return {kind: total[kind] / count[kind] for kind in sorted(count) if count[kind]}
+
+
+def faults(scenario: Scenario) -> list[str]:
+    """What was injected, in words."""
+    links, named = scenario.links, []
+    if links.loss:
+        named.append(f"loss {links.loss:g}")
+    if links.delay_s or links.delay_tail_s:
+        named.append(f"delay {links.delay_s:g} s + tail {links.delay_tail_s:g} s")
+    if links.duplicate:
+        named.append(f"duplicate {links.duplicate:g}")
+    return named
+
+
+def unmet(summary: dict[str, Any], expect: dict[str, BoundPart]) -> list[str]:
+    """Conditions of `[expect]` the summary breaks, one line each; keys are dotted paths into it."""
+    broken = []
+    for path, bound in expect.items():
+        value: Any = summary
+        for key in path.split("."):
+            value = value.get(key) if isinstance(value, dict) else None
+        if not isinstance(value, (int, float)):
+            broken.append(f"{path}: not in the summary")
+        elif bound.max is not None and value > bound.max:
+            broken.append(f"{path} = {value:.4g} is above {bound.max:g}")
+        elif bound.min is not None and value < bound.min:
+            broken.append(f"{path} = {value:.4g} is below {bound.min:g}")
+    return broken
