@@ -53,7 +53,7 @@ class Agent:
         self._odometry = OdometryTrack(settings.coast, settings.lateness.tolerance_ns, self.counters)
         localization = settings.localization
         self._options = Options(localization.transform, localization.parameters, localization.innovation_cap)
-        self._pairs = Pairs(settings, self._options, self.counters)
+        self._pairs = Pairs(settings, self._options, self.counters, self._count_nis)
         self._published: RobotState | None = None
 
     # -- events ---------------------------------------------------------------------------------------------

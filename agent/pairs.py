@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -49,7 +50,14 @@ FAR_FUTURE_NS = 2**62
 class Pairs:
     """The pair protocol with every peer met, bounded in number by the endpoint."""
 
-    def __init__(self, settings: AgentSettings, options: Options, counters: Counter[str]) -> None:
+    def __init__(
+        self,
+        settings: AgentSettings,
+        options: Options,
+        counters: Counter[str],
+        count_nis: Callable[[str, float], None],
+    ) -> None:
+        self._count_nis = count_nis
         self._settings, self._options, self._counters = settings, options, counters
         self._exchanges: dict[str, PairExchange] = {}
         self._lives: dict[str, tuple[int, int]] = {}
@@ -293,6 +301,7 @@ class Pairs:
             state = state.with_base(peer, epoch, np.zeros((len(psi), len(other.belief.mean))), psi)
         state = self._fuse_targets(other, t_ns, state, correlated)
         history.updated(state, update.left)
+        self._count_nis("pair_" + "+".join(item.kind for item in measurements), update.nis)
         self._counters["pair.applied_initiator" if own_initiated else "pair.applied_responder"] += 1
         return state
 

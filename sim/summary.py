@@ -17,7 +17,7 @@ NOT_COMPARED = "timing"
 def reduce(scenario: Scenario, result: TrialResult) -> dict[str, Any]:
     """The small part of a trial that a summary needs; what a worker process sends back."""
     return {
-        "figures": reduce_trial(result.trace, tuple(scenario.window_s)),
+        "figures": reduce_trial(result.trace, (scenario.window_s[0], scenario.window_s[1])),
         "network": result.network,
         "rejected": result.rejected,
         "nis": result.nis,
@@ -37,9 +37,7 @@ def summarize(
     exits: dict[str, int] | None = None,
 ) -> dict[str, Any]:
     """The whole summary, from the reduced trials in order."""
-    figures = combine(
-        [item["figures"] for item in reduced], tuple(scenario.window_s), scenario.lost_above_m
-    )
+    figures = combine([item["figures"] for item in reduced], scenario.lost_above_m)
     for robot, entry in figures["robots"].items():
         entry["nis"] = _nis([item["nis"].get(robot, {}) for item in reduced])
     network: Counter[str] = Counter()
