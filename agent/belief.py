@@ -106,9 +106,7 @@ class RobotState:
         record = self.pair(peer)
         lines = tuple(sorted((*record.lines, epoch)))
         dropped = lines[: max(0, len(lines) - max_lines)]
-        stack = self.stack.changed(
-            {(Part.LINE, peer, epoch): line}, tuple((Part.LINE, peer, e) for e in dropped)
-        )
+        stack = self.stack.changed({(Part.LINE, peer, epoch): line}, tuple((Part.LINE, peer, e) for e in dropped))
         kept = replace(record, lines=lines[len(dropped) :])
         return replace(self, stack=stack, pairs={**self.pairs, peer: kept})
 

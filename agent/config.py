@@ -212,9 +212,7 @@ def target_motion(
         sigma = (noise.speed_mps, noise.yaw_rate_radps)
     else:
         sigma = (noise.acceleration_mps2, noise.acceleration_mps2)
-    return TargetMotion(
-        LAYOUTS[model], (control.speed_mps, control.yaw_rate_radps), sigma, noise_step_s, damping_s
-    )
+    return TargetMotion(LAYOUTS[model], (control.speed_mps, control.yaw_rate_radps), sigma, noise_step_s, damping_s)
 
 
 class LandmarkPart(Part):
@@ -345,8 +343,7 @@ class AgentConfig(Part):
 
     def sensor_configs(self) -> dict[str, SensorConfig]:
         return {
-            name: SensorConfig((part.mount[0], part.mount[1], part.mount[2]))
-            for name, part in self.sensors.items()
+            name: SensorConfig((part.mount[0], part.mount[1], part.mount[2])) for name, part in self.sensors.items()
         }
 
 
@@ -435,7 +432,9 @@ def load_agent_config(path: Path) -> AgentConfig:
     config.initial.start_sigma.covariance("unicycle")
     simulated = config.mavlink is None or config.mavlink.simulated
     if not simulated and config.clock.source != "system":
-        raise ConfigError(f"{path}: clock.source = 'run' needs mavlink.simulated = true: a real autopilot keeps real time")
+        raise ConfigError(
+            f"{path}: clock.source = 'run' needs mavlink.simulated = true: a real autopilot keeps real time"
+        )
     if not simulated and config.injection is not None:
         raise ConfigError(f"{path}: [injection] is refused with a real autopilot; remove it")
     return config

@@ -108,9 +108,7 @@ class History:
         )
         state, _ = moved(self._settings, entry.state, t_ns, first, first_cov)
         localization = self._settings.localization
-        rest = advance(
-            state.mean, state.cov, second, second_cov, localization.transform, localization.parameters
-        )
+        rest = advance(state.mean, state.cov, second, second_cov, localization.transform, localization.parameters)
         return state, self._since(index + 2, following.after @ rest.F)
 
     def _since(self, index: int, psi: Array) -> Array:

@@ -75,9 +75,7 @@ class Pairs:
 
     def deadline_ns(self) -> int:
         """When the first pending request times out."""
-        return min(
-            (e.pending.deadline_ns for e in self._exchanges.values() if e.pending), default=FAR_FUTURE_NS
-        )
+        return min((e.pending.deadline_ns for e in self._exchanges.values() if e.pending), default=FAR_FUTURE_NS)
 
     def expire(self, now_ns: int) -> None:
         for exchange in self._exchanges.values():
@@ -155,27 +153,21 @@ class Pairs:
         if step is Step.REPEAT_REPLY and exchange.last_reply is not None:
             effects.append(Send(peer, epoch.t_meas_ns, exchange.last_reply))
             return state
-        refusal = {Step.ANSWER_BUSY: ReplyStatus.BUSY, Step.ANSWER_SUPERSEDED: ReplyStatus.SUPERSEDED}.get(
-            step
-        )
+        refusal = {Step.ANSWER_BUSY: ReplyStatus.BUSY, Step.ANSWER_SUPERSEDED: ReplyStatus.SUPERSEDED}.get(step)
         if refusal is not None:
             effects.append(Send(peer, epoch.t_meas_ns, PairReply(epoch, refusal)))
             return state
         found = history.at(t_ns)
         if found is None:
             self._counters["pair.too_old"] += 1
-            effects.append(
-                Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.TOO_OLD)))
-            )
+            effects.append(Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.TOO_OLD))))
             return state
         then, psi = found
         own = self.snapshot(then, peer)
         effects.append(Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.OK, own))))
         state = state.with_line(peer, epoch, psi, self._settings.localization.max_lines)
         history.updated(state)
-        return self._apply(
-            peer, epoch, request.snapshot, own, request.measurements, False, t_ns, state, history
-        )
+        return self._apply(peer, epoch, request.snapshot, own, request.measurements, False, t_ns, state, history)
 
     def reply(self, peer: str, reply: PairReply, state: RobotState, history: History) -> RobotState:
         """The peer answered a contact."""

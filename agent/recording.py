@@ -112,7 +112,7 @@ class RecordingWriter:
 
     def close(self) -> None:
         """Finish the file; a file that was not closed is refused by readers."""
-        self._writer.finish()
+        self._writer.finish()  # type: ignore[no-untyped-call]
         self._file.close()
 
 

@@ -171,7 +171,8 @@ class AgentShell:
         if self._control is None or self._control.started is None:
             raise ConfigError("clock.source = 'run' needs control_socket: the launcher starts the clock")
         stop = asyncio.ensure_future(self._stop.wait())
-        await asyncio.wait({self._control.started, stop}, return_when=asyncio.FIRST_COMPLETED)
+        waits: set[asyncio.Future[Any]] = {self._control.started, stop}
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
         stop.cancel()
         if self._stop.is_set() or self._control.started.cancelled() or not self._control.started.done():
             return False
@@ -270,7 +271,7 @@ class AgentShell:
             return {"robot": self.robot, "state": "waiting for the start"}
         agent = self._node.agent
         status: dict[str, Any] = {"robot": self.robot, **agent.status()}
-        status["peers"] = {peer.id: peer.up for peer in self._node.endpoint.peers()}
+        status["peers"] = {peer.robot: peer.up for peer in self._node.endpoint.peers()}
         status["rejected"] = rejected(self._node)
         status["lag_max_s"] = self._lag_ns * 1e-9
         status["injected"] = self.config.injection is not None

@@ -7,9 +7,9 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from agent.recording import RecordingError, merge, read_boundary, unpack
 from agent.effects import Publish
 from agent.events import Received
+from agent.recording import RecordingError, merge, read_boundary, unpack
 from agent.shell import FATE_COLUMNS
 from deploy.launch import Outcome
 from network.messages import PairReply, PairRequest
@@ -111,7 +111,9 @@ def _fates(scenario: Scenario, run_dir: Path) -> list[dict[str, str]]:
 def merge_fates(scenario: Scenario, run_dir: Path) -> None:
     """One `fates.csv` for the run, in place of one per receiver."""
     rows = _fates(scenario, run_dir)
-    rows.sort(key=lambda row: (int(row["t_send_ns"]), row["source"], row["destination"], row["channel"], int(row["seq"])))
+    rows.sort(
+        key=lambda row: (int(row["t_send_ns"]), row["source"], row["destination"], row["channel"], int(row["seq"]))
+    )
     with (run_dir / "fates.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, FATE_COLUMNS)
         writer.writeheader()

@@ -74,8 +74,15 @@ class Outcome:
 
 
 def agent_file(
-    scenario: Scenario, world: World, robot: RobotPart, seed: int, speed: float, plan: HostPlan, run_dir: Path,
-    state_dir: Path, ports: dict[str, int],
+    scenario: Scenario,
+    world: World,
+    robot: RobotPart,
+    seed: int,
+    speed: float,
+    plan: HostPlan,
+    run_dir: Path,
+    state_dir: Path,
+    ports: dict[str, int],
 ) -> dict[str, Any]:
     """The file of one agent: what is common to all runtimes, plus endpoints, clock and injection."""
     tables = agent_tables(scenario, world, robot)

@@ -19,7 +19,7 @@ from agent.node import Recorder
 from agent.recording import RecordingWriter
 from agent.shell import FATE_COLUMNS, fate_row
 from deploy.evaluate import collect, merge_fates, merge_recordings
-from deploy.launch import LaunchError, Launcher
+from deploy.launch import Launcher, LaunchError
 from deploy.status import LiveTable, Progress, print_summary
 from network.links import FateRecord
 from sim.agents import agent_config, table
@@ -101,9 +101,7 @@ def montecarlo(options: argparse.Namespace) -> int:
     _write_scenario(scenario, run_dir)
     started = time.perf_counter()
     with Progress(f"{scenario.name}: trials", quiet=False) as progress:
-        reduced = run_trials(
-            scenario, options.trials, options.jobs, options.seed, options.bound, progress.update
-        )
+        reduced = run_trials(scenario, options.trials, options.jobs, options.seed, options.bound, progress.update)
     summary = summarize(
         scenario,
         "virtual",
@@ -131,8 +129,7 @@ def _load(name: str, options: argparse.Namespace) -> Scenario:
     overrides = list(options.set)
     if options.duration is not None:
         overrides.append(f"duration_s={float(options.duration)!r}")
-    scenario = load(name, overrides)
-    return scenario
+    return load(name, overrides)
 
 
 def _run_dir(out: Path | None, name: str) -> Path:
@@ -152,15 +149,12 @@ def _write_scenario(scenario: Scenario, run_dir: Path) -> None:
 
 
 def _run_virtual(scenario: Scenario, options: argparse.Namespace, world: Any, run_dir: Path) -> TrialResult:
-    configs: dict[str, AgentConfig] = {
-        robot.id: agent_config(scenario, world, robot) for robot in scenario.robots
-    }
+    configs: dict[str, AgentConfig] = {robot.id: agent_config(scenario, world, robot) for robot in scenario.robots}
     writer = RecordingWriter(run_dir / "recording.mcap")
     (run_dir / "agents").mkdir(exist_ok=True)
     for robot, config in configs.items():
         writer.add_robot(config, 0)
-        with (run_dir / "agents" / f"{robot}.toml").open("wb") as file:
-            tomli_w.dump(table(config), file)
+        (run_dir / "agents" / f"{robot}.toml").write_text(tomli_w.dumps(table(config)))
 
     def recorder(robot: str) -> Recorder:
         return lambda event, effects: writer.record(robot, event, effects)

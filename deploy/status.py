@@ -40,7 +40,9 @@ class Progress:
         self._bar.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._bar.stop()
 
 
@@ -56,7 +58,9 @@ class LiveTable:
             self._live.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if self._live is not None:
             self._live.stop()
 
@@ -70,7 +74,17 @@ class LiveTable:
         played = launcher.progress() * self._scenario.duration_s
         title = f"{self._scenario.name}  {played:.0f} / {self._scenario.duration_s:.0f} s  at {self._speed:g} x"
         table = Table(title=title, title_justify="left")
-        for name in ("agent", "process", "x [m]", "y [m]", "sigma [m]", "neighbours", "contacts", "rejected", "lag [s]"):
+        for name in (
+            "agent",
+            "process",
+            "x [m]",
+            "y [m]",
+            "sigma [m]",
+            "neighbours",
+            "contacts",
+            "rejected",
+            "lag [s]",
+        ):
             table.add_column(name, justify="left" if name in ("agent", "process", "neighbours") else "right")
         for robot in self._scenario.robots:
             member = launcher.members.get(robot.id)

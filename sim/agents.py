@@ -53,9 +53,7 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
             for name, sensor in robot.sensors.items()
         },
         "targets": targets,
-        "landmarks": [
-            {"id": name, "position": [float(x), float(y)]} for name, (x, y) in world.landmarks.items()
-        ],
+        "landmarks": [{"id": name, "position": [float(x), float(y)]} for name, (x, y) in world.landmarks.items()],
         "zenoh": {"listen": [], "peers": []},
         "state_dir": "state",
     }
@@ -80,5 +78,3 @@ def odometry_table(scenario: Scenario, robot: RobotPart) -> dict[str, float]:
         "heading_rad_per_sqrt_s": noise.heading_rad_per_sqrt_s,
         "heading_rad_per_sqrt_rad": noise.heading_rad_per_sqrt_rad,
     }
-
-

@@ -27,9 +27,7 @@ class BoundRunner:
         for robot in scenario.robots:
             robots[robot.id] = (*world.start_belief(robot.id), LAYOUTS[robot.model])
         for target in scenario.targets:
-            motion = target_motion(
-                target.model, target.control, target.noise, scenario.step_s, target.damping_s
-            )
+            motion = target_motion(target.model, target.control, target.noise, scenario.step_s, target.damping_s)
             targets[target.id] = (*world.start_belief(target.id), motion)
         self._filter = CentralizedFilter(
             robots,

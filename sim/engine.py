@@ -26,8 +26,8 @@ from network.wire import peek_header
 from sim.agents import agent_config
 from sim.bound import BoundRunner
 from sim.metrics import StateTrace, TrialTrace
-from sim.scenario import Scenario
 from sim.reach import Reach
+from sim.scenario import Scenario
 from sim.world import Output, World
 
 Array = NDArray[np.float64]
@@ -79,8 +79,7 @@ class Sampler:
         self._world = world
         self._stride = sample_stride(world.step_ns)
         self._instants = list(range(0, world.steps + 1, self._stride))
-        models = {part.id: part.model for part in (*scenario.robots, *scenario.targets)}
-        self._layouts = {name: LAYOUTS[model] for name, model in models.items()}
+        self._layouts = {name: LAYOUTS[part.model] for name, part in scenario.movers().items()}
         self._owned: dict[tuple[str, str], tuple[Array, Array]] = {}
         for robot in world.robots:
             for entity in (robot, *world.targets):
@@ -200,9 +199,7 @@ class VirtualEngine:
             self._now = t_ns
             node = self._nodes[robot]
             if isinstance(what, Output):
-                payload = encode(
-                    t_ns, what.kind, what.z, what.R, of=what.of, sensor=what.sensor, t0_ns=what.t0_ns
-                )
+                payload = encode(t_ns, what.kind, what.z, what.R, of=what.of, sensor=what.sensor, t0_ns=what.t0_ns)
                 self._carry_out(robot, node.on_sensor(t_ns, payload))
             elif isinstance(what, Packet):
                 self._deliver(robot, node, what)
@@ -287,6 +284,11 @@ class VirtualEngine:
         }
         network = network_figures(self._traffic, counters)
         return TrialResult(
-            self._sampler.trace(), self.contacts, network, dict(sorted(refused.items())), nis, counters, self.step_us
+            self._sampler.trace(),
+            self.contacts,
+            network,
+            dict(sorted(refused.items())),
+            nis,
+            counters,
+            self.step_us,
         )
-

@@ -111,7 +111,10 @@ def reduce_trial(trace: TrialTrace, window_s: Window) -> dict[str, Any]:
 
 
 def _beliefs(reduced: dict[str, Any]) -> list[dict[str, Any]]:
-    return [*reduced["robots"].values(), *(item for owners in reduced["targets"].values() for item in owners.values())]
+    return [
+        *reduced["robots"].values(),
+        *(item for owners in reduced["targets"].values() for item in owners.values()),
+    ]
 
 
 def _rmse(items: Sequence[dict[str, Any]], key: str = "position") -> float | None:
@@ -143,7 +146,9 @@ def _entity(items: Sequence[dict[str, Any]], robot: bool) -> dict[str, Any]:
     elif not robot:
         figures["velocity_rmse_mps"] = _rmse(items, "rest")
     if robot:
-        figures["position_error_max_m"] = max((i["max_position"] for i in items if i["max_position"] is not None), default=None)
+        figures["position_error_max_m"] = max(
+            (i["max_position"] for i in items if i["max_position"] is not None), default=None
+        )
         figures["final_position_error_m"] = _median([item["final"] for item in items])
     figures["anees"] = _mean(items, "nees")
     figures["containment_3sigma"] = _mean(items, "inside")
@@ -201,9 +206,7 @@ def combine(trials: Sequence[dict[str, Any]], lost_above_m: float) -> dict[str, 
         "lost": len(trials) - len(converged),
         "robots": {name: _entity([trial["robots"][name] for trial in used], True) for name in first["robots"]},
         "targets": {
-            target: {
-                name: _entity([trial["targets"][target][name] for trial in used], False) for name in owners
-            }
+            target: {name: _entity([trial["targets"][target][name] for trial in used], False) for name in owners}
             for target, owners in first["targets"].items()
         },
         "fleet": fleet_figures(used),
@@ -222,9 +225,7 @@ def combine(trials: Sequence[dict[str, Any]], lost_above_m: float) -> dict[str, 
             **fleet_figures(kept),
             "lost": len(bounds) - len(kept),
             "robots": {name: _entity([bound["robots"][name] for bound in kept], True) for name in first["robots"]},
-            "targets": {
-                name: _entity([bound["targets"][name] for bound in kept], False) for name in first["targets"]
-            },
+            "targets": {name: _entity([bound["targets"][name] for bound in kept], False) for name in first["targets"]},
         }
     summary["series"] = _series(used)
     return summary

@@ -82,7 +82,9 @@ class RecordedWorld:
             for name, sensor in robot.sensors.items():
                 if ("peers" if peer else "landmarks") not in sensor.of:
                     continue
-                z, R = self._measured(name, sensor, float(sightings.range_m[index]), float(sightings.bearing_rad[index]))
+                z, R = self._measured(
+                    name, sensor, float(sightings.range_m[index]), float(sightings.bearing_rad[index])
+                )
                 t_ns = int(sightings.t_ns[index]) - self._start_ns
                 outputs.append(Output(t_ns, phase_of(of), robot.id, name, sensor_kind(name, sensor), of, z, R))
         return outputs

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from agent.config import (
+    P,
     CoastPart,
     ConfigError,
     ControlNoisePart,
@@ -22,10 +23,10 @@ from agent.config import (
     LinksPart,
     LocalizationPart,
     NetworkPart,
+    NotNegative,
     OdometryPart,
     Part,
     Positive,
-    NotNegative,
     SigmaPart,
     TrackingPart,
     Vector2,
@@ -147,6 +148,11 @@ class Scenario(Part):
     landmarks: list[LandmarkPart] = []
     expect: dict[str, BoundPart] = {}
 
+    def movers(self) -> dict[str, RobotPart | TargetPart]:
+        """Robots, then targets, by id."""
+        parts: list[RobotPart | TargetPart] = [*self.robots, *self.targets]
+        return {part.id: part for part in parts}
+
     def localization_of(self, robot: RobotPart) -> LocalizationPart:
         return self._overridden(LocalizationPart, self.localization, robot, "localization")
 
@@ -156,8 +162,8 @@ class Scenario(Part):
     def tracking_of(self, robot: RobotPart) -> TrackingPart:
         return self._overridden(TrackingPart, self.tracking, robot, "tracking")
 
-    def _overridden(self, model: Any, base: Part, robot: RobotPart, name: str) -> Any:
-        own = getattr(robot, name)
+    def _overridden(self, model: type[P], base: P, robot: RobotPart, name: str) -> P:
+        own: dict[str, Any] = getattr(robot, name)
         if not own:
             return base
         merged = {**base.model_dump(), **own}
@@ -283,4 +289,4 @@ def check_sensor(where: str, name: str, sensor: SensorPart) -> None:
     if needs_rad and sensor.sigma_rad is None:
         raise ConfigError(f"{where}: sigma_rad is missing")
     if kind in ("range", "bearing", "range_bearing") and not sensor.of:
-        raise ConfigError(f"{where}: of is missing, for instance of = [\"peers\"]")
+        raise ConfigError(f'{where}: of is missing, for instance of = ["peers"]')

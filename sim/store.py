@@ -61,9 +61,7 @@ def load_trace(run_dir: Path) -> Stored | None:
         targets: dict[str, dict[str, StateTrace]] = {}
         bound: dict[str, dict[str, StateTrace]] = {"robots": {}, "targets": {}}
         for key, entry in enumerate(meta["index"]):
-            state = StateTrace(
-                data[f"{key}.truth"], data[f"{key}.mean"], data[f"{key}.cov"], tuple(entry["angles"])
-            )
+            state = StateTrace(data[f"{key}.truth"], data[f"{key}.mean"], data[f"{key}.cov"], tuple(entry["angles"]))
             names = entry["names"]
             if entry["group"] == "robots":
                 robots[names[0]] = state
@@ -71,8 +69,6 @@ def load_trace(run_dir: Path) -> Stored | None:
                 targets.setdefault(names[0], {})[names[1]] = state
             else:
                 bound[entry["group"].removeprefix("bound.")][names[0]] = state
-        trace = TrialTrace(
-            t_s=data["t_s"], robots=robots, targets=targets, bound=bound if meta["bound"] else None
-        )
+        trace = TrialTrace(t_s=data["t_s"], robots=robots, targets=targets, bound=bound if meta["bound"] else None)
     contacts = [(float(t), str(a), str(b)) for t, a, b in meta["contacts"]]
     return Stored(trace, contacts, {name: (float(x), float(y)) for name, (x, y) in meta["landmarks"].items()})

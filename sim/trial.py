@@ -35,7 +35,5 @@ def run_trial(
 ) -> TrialResult:
     """Play one trial; equal arguments give equal results."""
     world = world if world is not None else open_world(scenario, seed)
-    engine = VirtualEngine(
-        scenario, world, seed, with_bound=with_bound, recorders=recorders, fate_sink=fate_sink
-    )
+    engine = VirtualEngine(scenario, world, seed, with_bound=with_bound, recorders=recorders, fate_sink=fate_sink)
     return engine.run(progress)

@@ -149,10 +149,10 @@ class SimulatedWorld:
         return track
 
     def truth(self, entity: str, k: int) -> Array:
-        return self._tracks[entity][k]
+        return np.asarray(self._tracks[entity][k])
 
     def start_belief(self, entity: str) -> tuple[Array, Array]:
-        part = next(p for p in (*self._scenario.robots, *self._scenario.targets) if p.id == entity)
+        part = self._scenario.movers()[entity]
         return drawn_belief(self._tracks[entity][0], part.start_sigma.covariance(part.model), self._seed, entity)
 
     def outputs(self, k: int) -> list[Output]:

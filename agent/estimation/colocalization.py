@@ -74,9 +74,7 @@ def absolute_update(
     and Psi, the left factor since then: K = Psi C S^-1 (Larsen et al. 1998, exact for one such measurement,
     consistent for any number). None when the posterior would not be positive definite.
     """
-    predicted = observe(
-        model.h, model.jacobian, mean, cov, model.angles, options.transform, options.parameters
-    )
+    predicted = observe(model.h, model.jacobian, mean, cov, model.angles, options.transform, options.parameters)
     innovation = _innovation(predicted, z, model.angles)
     S, nis = _capped(innovation, predicted.cov + R, options.innovation_cap)
     now_mean, now_cov, psi = present if present is not None else (mean, cov, None)
@@ -136,9 +134,7 @@ def sighting_update(
         S = own_term + target_term + noise
         return (
             _applied(own_mean, own_cov, own_layout, gain(own_cov @ H_own.T, S), S, innovation, nis),
-            _applied(
-                target_mean, target_cov, target_layout, gain(target_cov @ H_target.T, S), S, innovation, nis
-            ),
+            _applied(target_mean, target_cov, target_layout, gain(target_cov @ H_target.T, S), S, innovation, nis),
             nis,
         )
     results: list[Update | None] = []
@@ -256,9 +252,7 @@ def contact(
         R[row : row + len(item.z), row : row + len(item.z)] = item.R
         row += len(item.z)
     mean = np.concatenate([initiator.belief.mean, responder.belief.mean])
-    predicted = observe(
-        model.h, model.jacobian, mean, joint, model.angles, options.transform, options.parameters
-    )
+    predicted = observe(model.h, model.jacobian, mean, joint, model.angles, options.transform, options.parameters)
     innovation = _innovation(predicted, z, model.angles)
     plain = predicted.cov + R
     S, nis = _capped(innovation, plain, options.innovation_cap)

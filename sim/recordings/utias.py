@@ -142,7 +142,8 @@ def _rows(folder: Path, name: str, columns: int) -> Iterator[tuple[str, ...]]:
     if path is None:
         raise RecordingError(f"{folder}: {name}.dat is missing; give the path of an unpacked MR.CLAM data set")
     try:
-        text = lzma.open(path, "rt").read() if path.suffix == ".xz" else path.read_text()
+        raw = path.read_bytes()
+        text = (lzma.decompress(raw) if path.suffix == ".xz" else raw).decode()
     except (EOFError, lzma.LZMAError):
         raise RecordingError(f"{path}: the compressed file is cut or damaged; fetch it again") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -216,7 +217,7 @@ def _arc(pose: Array, v: float, w: float, dt: float) -> Array:
 def _integrated(odometry: Odometry, t_ns: int) -> Array:
     index = int(np.searchsorted(odometry.t_ns, t_ns, side="right")) - 1
     if index < 0:
-        return odometry.pose[0]
+        return np.asarray(odometry.pose[0])
     dt = (t_ns - int(odometry.t_ns[index])) * 1e-9
     return _arc(odometry.pose[index], float(odometry.v_mps[index]), float(odometry.w_radps[index]), dt)
 
