@@ -271,7 +271,7 @@ class AgentShell:
             return {"robot": self.robot, "state": "waiting for the start"}
         agent = self._node.agent
         status: dict[str, Any] = {"robot": self.robot, **agent.status()}
-        status["peers"] = {peer.robot: peer.up for peer in self._node.endpoint.peers()}
+        status["peers"] = {peer.peer: peer.up for peer in self._node.endpoint.peers()}
         status["rejected"] = rejected(self._node)
         status["lag_max_s"] = self._lag_ns * 1e-9
         status["injected"] = self.config.injection is not None

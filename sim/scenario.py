@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from agent.config import (
-    P,
     CoastPart,
     ConfigError,
     ControlNoisePart,
@@ -25,6 +24,7 @@ from agent.config import (
     NetworkPart,
     NotNegative,
     OdometryPart,
+    P,
     Part,
     Positive,
     SigmaPart,

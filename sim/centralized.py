@@ -1,0 +1,109 @@
+"""The centralized filter: one joint Gaussian over all robots and targets, fed with everything.
+
+It is what a fleet could know at best with these sensors and this transform. Measurements are linearized
+statistically over the states they involve only, K = P[:, sub] H^T S^-1 with S = Szz + R.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.estimation.gaussian import gain, quadratic_form, symmetrize, wrap_components
+from agent.estimation.motion import StateLayout, TargetMotion, advance
+from agent.estimation.observation import AbsoluteModel, RelativeModel
+from agent.estimation.unscented import Propagated, Transform, observe
+
+Array = NDArray[np.float64]
+
+
+class CentralizedFilter:
+    """Joint belief of robots {id: (mean (n,), cov (n, n), layout)} and targets {id: (mean, cov, motion)}."""
+
+    def __init__(
+        self,
+        robots: dict[str, tuple[Array, Array, StateLayout]],
+        targets: dict[str, tuple[Array, Array, TargetMotion]],
+        landmarks: dict[str, tuple[float, float]],
+        transform: Transform = "unscented",
+        innovation_cap: float = 0.0,
+    ) -> None:
+        self._landmarks, self._transform, self._cap = landmarks, transform, innovation_cap
+        self._motions = {name: motion for name, (_, _, motion) in targets.items()}
+        self._parts: dict[str, slice] = {}
+        starts = [(name, mean, cov, layout) for name, (mean, cov, layout) in robots.items()]
+        starts += [(name, mean, cov, motion.layout) for name, (mean, cov, motion) in targets.items()]
+        size = sum(len(mean) for _, mean, _, _ in starts)
+        self.mean, self.cov = np.zeros(size), np.zeros((size, size))
+        angles: list[int] = []
+        offset = 0
+        for name, mean, cov, layout in starts:
+            part = slice(offset, offset + len(mean))
+            self._parts[name], self.mean[part], self.cov[part, part] = part, mean, cov
+            angles += [offset + index for index in layout.angles]
+            offset += len(mean)
+        self._angles = tuple(angles)
+
+    def belief(self, name: str) -> tuple[Array, Array]:
+        """Marginal mean (n,) and covariance (n, n)."""
+        part = self._parts[name]
+        return self.mean[part].copy(), self.cov[part, part].copy()
+
+    def cross(self, first: str, second: str) -> Array:
+        """Cross-covariance (n_a, n_b)."""
+        return np.array(self.cov[self._parts[first], self._parts[second]])
+
+    def odometry(self, robot: str, delta: Array, cov: Array) -> None:
+        """Move a robot by an increment (4,) with covariance (4, 4)."""
+        self._predict(robot, advance(*self.belief(robot), delta, cov, self._transform))
+
+    def drift_targets(self, dt_s: float) -> None:
+        """Move all targets by their models."""
+        for name, motion in self._motions.items():
+            self._predict(name, motion.drift(*self.belief(name), dt_s, self._transform))
+
+    def fix(self, robot: str, kind: str, z: Array, R: Array) -> None:
+        """Absolute information z (m,), R (m, m)."""
+        part = self._parts[robot]
+        self._update(self._rows(robot), AbsoluteModel(kind, part.stop - part.start), z, R)
+
+    def observe(
+        self, robot: str, kind: str, of: str, z: Array, R: Array, mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> None:
+        """A relative measurement of `r2`, `landmark:L3` or `target:t1`."""
+        rows = self._rows(robot)
+        if of.startswith("landmark:"):
+            point = self._landmarks[of.removeprefix("landmark:")]
+            self._update(rows, RelativeModel(kind, len(rows), mount, point), z, R)
+            return
+        other = self._rows(of.removeprefix("target:"))
+        self._update(np.concatenate([rows, other]), RelativeModel(kind, len(rows), mount), z, R)
+
+    def _rows(self, name: str) -> NDArray[np.intp]:
+        part = self._parts[name]
+        return np.arange(part.start, part.stop)
+
+    def _predict(self, name: str, moved: Propagated) -> None:
+        part = self._parts[name]
+        self.mean[part] = moved.mean
+        self.cov[part, :] = moved.F @ self.cov[part, :]
+        self.cov[:, part] = self.cov[part, :].T
+        self.cov[part, part] = moved.cov
+
+    def _update(self, rows: NDArray[np.intp], model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> None:
+        predicted = observe(
+            model.h,
+            model.jacobian,
+            self.mean[rows],
+            self.cov[np.ix_(rows, rows)],
+            model.angles,
+            self._transform,
+        )
+        innovation = wrap_components(z - predicted.z, model.angles)
+        S = predicted.cov + R
+        nis = float(quadratic_form(innovation, S)) / len(innovation)
+        if 0.0 < self._cap < nis:
+            S = S * (nis / self._cap)
+        K = gain(self.cov[:, rows] @ predicted.H.T, S)
+        self.mean = wrap_components(self.mean + K @ innovation, self._angles)
+        self.cov = symmetrize(self.cov - K @ S @ K.T)
