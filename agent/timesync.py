@@ -133,6 +133,10 @@ class TimeSync:
             return None
         return time_usec * 1000
 
+    def step(self) -> None:
+        """The own clock was set: nothing known of the offset holds any longer."""
+        self._forget("mavlink.clock_step")
+
     def _forget(self, reason: str) -> None:
         self._counters[reason] += 1
         self.epoch += 1

@@ -14,7 +14,7 @@ from sim.plots import Contacts, ReportUnavailable
 STYLE = """
 :root { --ink: #1f2430; --soft: #5f6675; --line: #e3e6eb; --accent: #0072B2; }
 * { box-sizing: border-box; }
-body { margin: 0; background: #f6f7f9; color: var(--ink); 
+body { margin: 0; background: #f6f7f9; color: var(--ink);
   font: 15px/1.5 system-ui, -apple-system, "Segoe UI", sans-serif; }
 main { max-width: 1120px; margin: 0 auto; padding: 32px 24px 64px; }
 h1 { font-size: 26px; margin: 0 0 4px; letter-spacing: -0.01em; }
