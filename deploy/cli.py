@@ -139,9 +139,8 @@ def _montecarlo(options: argparse.Namespace) -> int:
 
 
 def _agent(options: argparse.Namespace) -> int:
-    from agent.mavlink import MavlinkError
-
     from agent.config import load_agent_config
+    from agent.mavlink import MavlinkError
     from agent.shell import AgentShell
     from network.transport import TransportError
 
