@@ -98,6 +98,12 @@ def decode(payload: bytes, now_ns: int, sensors: dict[str, SensorConfig]) -> Eve
     size = SIZES[kind]
     z = _array(data.get("z"), (size,))
     R = _array(data.get("R"), (size, size))
+    of = data.get("of")
+    about_itself = kind == "odometry" or kind in ABSOLUTE_KINDS
+    if of is not None and (about_itself or type(of) is not str or not _SUBJECT.match(of)):
+        raise SensorError("bad_subject")
+    if not np.array_equal(R, R.T):
+        raise SensorError("not_positive_definite")
     if kind == "odometry":
         t0_ns = _stamp(data.get("t0_ns"))
         if t0_ns >= t_ns:
@@ -105,13 +111,10 @@ def decode(payload: bytes, now_ns: int, sensors: dict[str, SensorConfig]) -> Eve
         if np.any(np.diagonal(R) < 0.0) or not is_positive_definite(R + np.eye(size) * FLOOR):
             raise SensorError("not_positive_definite")
         return Odometry(now_ns, t0_ns, t_ns, z, R)
-    if not np.array_equal(R, R.T) or np.any(np.diagonal(R) < FLOOR) or not is_positive_definite(R):
+    if np.any(np.diagonal(R) < FLOOR) or not is_positive_definite(R):
         raise SensorError("not_positive_definite")
     if kind in ABSOLUTE_KINDS:
         return Fix(now_ns, t_ns, kind, z, R, sensor)
-    of = data.get("of")
-    if of is not None and (type(of) is not str or not _SUBJECT.match(of)):
-        raise SensorError("bad_subject")
     if kind != "bearing" and z[0] < 0.0:
         raise SensorError("out_of_range")
     mount = sensors[sensor].mount if sensor in sensors else (0.0, 0.0, 0.0)
