@@ -71,7 +71,7 @@ class AgentShell:
         self._sensor_transport: asyncio.BaseTransport | None = None
         self._receive: Any = None
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_due_ns = 0
+        self._timer_due_ns = self._timer_set_ns = 0
         self._published_s = 0.0
         self._lag_ns = 0
         self._stop = asyncio.Event()
@@ -239,7 +239,7 @@ class AgentShell:
         assert self._node is not None
         now_ns = self._clock.now_ns()
         self._timer = None
-        self._lag_ns = max(self._lag_ns, now_ns - self._timer_due_ns)
+        self._lag_ns = max(self._lag_ns, now_ns - self._timer_set_ns)
         self._carry_out(self._node.on_tick(now_ns))
 
     def _carry_out(self, out: Outgoing) -> None:
@@ -261,8 +261,9 @@ class AgentShell:
             if deadline == self._timer_due_ns:
                 return
             self._timer.cancel()
-        wait_s = min(max(self._clock.wall_s(deadline - self._clock.now_ns()), 0.0005), 60.0)
-        self._timer_due_ns = deadline
+        now_ns = self._clock.now_ns()
+        wait_s = min(max(self._clock.wall_s(deadline - now_ns), 0.0005), 60.0)
+        self._timer_due_ns, self._timer_set_ns = deadline, max(deadline, now_ns)
         self._timer = asyncio.get_running_loop().call_later(wait_s, self._on_timer)
 
     def status(self) -> dict[str, Any]:
@@ -300,6 +301,7 @@ class AgentShell:
             self._timer.cancel()
         figures = self._figures() if self._node is not None else None
         self._node = None
+        self._receive = _ignore
         if self._mavlink is not None:
             await self._mavlink.close()
         if self._sensor_transport is not None:
@@ -317,6 +319,10 @@ class AgentShell:
             if opened is not None:
                 with contextlib.suppress(TimeoutError):
                     await opened.close()
+
+
+def _ignore(packet: Packet) -> None:
+    """Takes the packets that still arrive while the shell closes."""
 
 
 FATE_COLUMNS = (

@@ -69,11 +69,9 @@ def run(options: argparse.Namespace) -> int:
         merge_recordings(scenario, run_dir)
         merge_fates(scenario, run_dir)
     steps = sorted(result.step_us)
-    timing = {
-        "wall_s": time.perf_counter() - started,
-        "lag_max_s": lag_max_s,
-        "step_us_median": steps[len(steps) // 2] if steps else 0.0,
-    }
+    timing = {"wall_s": time.perf_counter() - started, "lag_max_s": lag_max_s}
+    if steps:
+        timing["step_us_median"] = steps[len(steps) // 2]
     summary = summarize(
         scenario,
         runtime,
