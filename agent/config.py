@@ -9,7 +9,8 @@ import difflib
 import math
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from types import UnionType
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -41,6 +42,9 @@ Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 
 class ConfigError(ValueError):
     """A file or key the user has to change; the message is one line that says how."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.split()))
 
 
 class Part(BaseModel):
@@ -382,6 +386,8 @@ def explain(model: type[BaseModel], data: dict[str, Any], error: ValidationError
     if first["type"] == "missing":
         return f"key '{path}' is missing"
     message = first["msg"][0].lower() + first["msg"][1:]
+    if first["type"] in ("model_type", "dict_type"):
+        message = "a table is needed"
     shown = repr(value) if isinstance(value, (str, int, float, bool)) else type(value).__name__
     if isinstance(value, float) and math.isnan(value):
         shown = "nan"
@@ -405,31 +411,46 @@ def _valid_names(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]
     """Field names of the table at `location` below `model`."""
     here: Any = model
     for key in location:
-        if isinstance(key, str) and isinstance(here, type) and issubclass(here, BaseModel):
-            field = here.model_fields.get(key)
-            here = field.annotation if field is not None else None
-        here = _model_inside(here)
-    if isinstance(here, type) and issubclass(here, BaseModel):
-        return sorted(here.model_fields)
-    return []
+        if _is_table(here):
+            field = here.model_fields.get(str(key))
+            here = _required(field.annotation) if field is not None else None
+        else:
+            # An index or a name of free choice: on to the type of the entries.
+            here = _required((get_args(here) or (None,))[-1])
+    return sorted(here.model_fields) if _is_table(here) else []
 
 
-def _model_inside(annotation: Any) -> Any:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for argument in getattr(annotation, "__args__", ()):
-        found = _model_inside(argument)
-        if isinstance(found, type) and issubclass(found, BaseModel):
-            return found
+def _is_table(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _required(annotation: Any) -> Any:
+    """A type without its `| None`."""
+    if get_origin(annotation) is UnionType:
+        return next(argument for argument in get_args(annotation) if argument is not type(None))
     return annotation
 
 
 def load_agent_config(path: Path) -> AgentConfig:
     """Read one robot's file. Raises `ConfigError`."""
     config = validate(AgentConfig, read_toml(path), str(path))
-    for target in config.targets:
-        target.settings()
-    config.initial.start_sigma.covariance("unicycle")
+    try:
+        for target in config.targets:
+            target.settings()
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    try:
+        config.initial.start_sigma.covariance("unicycle")
+    except ConfigError as error:
+        raise ConfigError(f"{path}: initial.{error}") from None
+    for name, ids in (
+        ("target", [target.id for target in config.targets]),
+        ("landmark", [landmark.id for landmark in config.landmarks]),
+        ("peer", [peer.id for peer in config.zenoh.peers]),
+    ):
+        twice = next((item for item in ids if ids.count(item) > 1), None)
+        if twice is not None:
+            raise ConfigError(f"{path}: {name} id '{twice}' is used twice; ids must differ")
     simulated = config.mavlink is None or config.mavlink.simulated
     if not simulated and config.clock.source != "system":
         raise ConfigError(

@@ -37,6 +37,9 @@ from agent.config import (
 
 Subject = Literal["peers", "landmarks", "targets"]
 
+MIN_STEP_S = 0.001
+"""The shortest step of a world."""
+
 
 class PlacementPart(Part):
     """Where robots start: each on its circle at a phase drawn from the seed.
@@ -244,6 +247,17 @@ def check(scenario: Scenario) -> None:
     for name in ids:
         if ids.count(name) > 1:
             raise ConfigError(f"{scenario.name}: id '{name}' is used twice; ids must differ")
+    names = [landmark.id for landmark in scenario.landmarks]
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"{scenario.name}: landmark id '{name}' is used twice; ids must differ")
+    if scenario.step_s < MIN_STEP_S:
+        raise ConfigError(f"{scenario.name}: step_s = {scenario.step_s:g} is below {MIN_STEP_S:g} s; enlarge it")
+    if scenario.duration_s < scenario.step_s:
+        raise ConfigError(
+            f"{scenario.name}: duration_s = {scenario.duration_s:g} is shorter than one step; "
+            f"make it at least step_s = {scenario.step_s:g}"
+        )
     if not 0.0 <= scenario.window_s[0] < scenario.window_s[1]:
         raise ConfigError(f"{scenario.name}: window_s must be [from, to] with from < to")
     if scenario.window_s[0] >= scenario.duration_s:
@@ -254,8 +268,15 @@ def check(scenario: Scenario) -> None:
     recorded = scenario.world.kind == "recording"
     if recorded and scenario.world.path is None:
         raise ConfigError(f"{scenario.name}: world.path is missing; add --set world.path=FOLDER of the recording")
+    placement = scenario.world.placement
+    circling = [robot.id for robot in scenario.robots if robot.start.circle is not None]
+    if placement is not None and circling and placement.reaches not in circling:
+        raise ConfigError(
+            f"{scenario.name}: world.placement.reaches = '{placement.reaches}' is no robot on a circle; "
+            f"there are: {', '.join(circling)}"
+        )
     for robot in scenario.robots:
-        robot.start_sigma.covariance(robot.model)
+        _check_sigma(f"{scenario.name}: robots.{robot.id}", robot)
         scenario.localization_of(robot), scenario.lateness_of(robot), scenario.tracking_of(robot)
         if not recorded and (robot.start.pose is None) == (robot.start.circle is None):
             raise ConfigError(f"{scenario.name}: robots.{robot.id}.start needs either 'pose' or 'circle'")
@@ -264,9 +285,16 @@ def check(scenario: Scenario) -> None:
         for name, sensor in robot.sensors.items():
             check_sensor(f"{scenario.name}: robots.{robot.id}.sensors.{name}", name, sensor)
     for target in scenario.targets:
-        target.start_sigma.covariance(target.model)
+        _check_sigma(f"{scenario.name}: targets.{target.id}", target)
         if target.start.pose is None:
             raise ConfigError(f"{scenario.name}: targets.{target.id}.start.pose is missing")
+
+
+def _check_sigma(where: str, part: RobotPart | TargetPart) -> None:
+    try:
+        part.start_sigma.covariance(part.model)
+    except ConfigError as error:
+        raise ConfigError(f"{where}.{error}") from None
 
 
 KINDS = ("range", "bearing", "range_bearing", "position", "pose", "heading")

@@ -1,0 +1,182 @@
+"""One robot's file: read strictly, and every mistake gets one line with the key and the remedy."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+
+from agent.config import (
+    AgentConfig,
+    ConfigError,
+    LocalizationPart,
+    OdometryPart,
+    SigmaPart,
+    load_agent_config,
+    validate,
+)
+
+
+def example(**change: Any) -> dict[str, Any]:
+    """A complete file of one robot."""
+    return {
+        "version": 1,
+        "identity": {"fleet": "test", "robot": "r1", "incarnation": 1},
+        "origin": [47.4, 8.5, 488.0],
+        "initial": {"mean": [1.0, 2.0, 0.5], "start_sigma": {"position_m": 0.5, "heading_rad": 0.1}},
+        "sensors": {
+            "uwb": {"kind": "range", "mount": [0.1, 0.0, 0.0]},
+            "camera": {"kind": "range", "two_way": False},
+        },
+        "targets": [
+            {
+                "id": "t1",
+                "model": "constant_velocity",
+                "mean": [0.0, 0.0, 1.0, 1.0],
+                "start_sigma": {"position_m": 1.0, "velocity_mps": 0.5},
+                "noise": {"acceleration_mps2": 0.2},
+            }
+        ],
+        "landmarks": [{"id": "L3", "position": [4.0, 5.0]}],
+        "zenoh": {"listen": ["udp/127.0.0.1:20001"], "peers": [{"id": "r2", "endpoints": ["udp/127.0.0.1:20002"]}]},
+        "mavlink": {"endpoint": "udpin:127.0.0.1:14550", "simulated": True},
+        "state_dir": "state",
+    } | change
+
+
+def write(folder: Path, data: dict[str, Any]) -> Path:
+    path = folder / "r1.toml"
+    path.write_text(tomli_w.dumps(data))
+    return path
+
+
+def complaint(folder: Path, data: dict[str, Any]) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load_agent_config(write(folder, data))
+    line = str(caught.value)
+    assert len(line.splitlines()) == 1
+    assert "r1.toml" in line
+    return line
+
+
+# --- what a file means ------------------------------------------------------------------------------------
+
+
+def test_a_file_becomes_what_the_core_is_given(tmp_path: Path) -> None:
+    config = load_agent_config(write(tmp_path, example(lateness={"horizon_s": 7.5, "settle_s": 0.25})))
+    settings = config.settings(start_ns=123)
+    assert (settings.robot, settings.start_ns, settings.track) == ("r1", 123, True)
+    np.testing.assert_array_equal(settings.mean, [1.0, 2.0, 0.5])
+    np.testing.assert_allclose(settings.cov, np.diag([0.25, 0.25, 0.01]))
+    assert settings.landmarks == {"L3": (4.0, 5.0)}
+    assert settings.one_way_sensors == ("camera",)
+    assert (settings.lateness.horizon_ns, settings.lateness.settle_ns) == (7_500_000_000, 250_000_000)
+    (target,) = settings.targets
+    np.testing.assert_allclose(target.cov, np.diag([1.0, 1.0, 0.25, 0.25]))
+    assert target.motion.noise_sigma == (0.2, 0.2)
+    assert config.sensor_configs()["uwb"].mount == (0.1, 0.0, 0.0)
+
+
+def test_without_tracking_no_target_is_tracked() -> None:
+    config = validate(AgentConfig, example(tracking={"kind": "none"}), "r1")
+    assert config.settings(0).track is False
+
+
+def test_the_forms_stand_for_their_parts() -> None:
+    safe, published = LocalizationPart().settings(), LocalizationPart(form="published").settings()
+    assert (safe.pair_interval_ns, safe.sighting_weight) == (3_000_000_000, "trace")
+    assert (published.pair_interval_ns, published.sighting_weight) == (0, "logdet")
+    assert LocalizationPart(pair_interval_s=0.5).settings().pair_interval_ns == 500_000_000
+    assert LocalizationPart(form="published", pair_interval_s=2.0).settings().pair_interval_ns == 2_000_000_000
+
+
+def test_the_horizon_of_the_history_is_the_age_limit_of_messages() -> None:
+    config = validate(AgentConfig, example(), "r1")
+    assert config.network.settings(horizon_s=4.0).horizon_ns == 4_000_000_000
+
+
+def test_odometry_noise_is_handed_over_completely() -> None:
+    part = OdometryPart(along_m_per_sqrt_m=0.12, scale_turn=0.9)
+    noise = part.noise()
+    for name, value in part.model_dump().items():
+        assert getattr(noise, name) == value
+
+
+def test_a_configuration_survives_json() -> None:
+    """Recordings keep it that way."""
+    config = validate(AgentConfig, example(), "r1")
+    assert AgentConfig.model_validate(json.loads(json.dumps(config.model_dump()))) == config
+
+
+def test_a_belief_needs_the_deviation_its_model_asks_for() -> None:
+    with pytest.raises(ConfigError, match="heading_rad is missing"):
+        SigmaPart(position_m=1.0).covariance("unicycle")
+    with pytest.raises(ConfigError, match="velocity_mps is missing"):
+        SigmaPart(position_m=1.0, heading_rad=1.0).covariance("damped_velocity")
+
+
+# --- mistakes ---------------------------------------------------------------------------------------------
+
+INITIAL = {"mean": [1.0, 2.0, 0.5], "start_sigma": {"position_m": 0.5, "heading_rad": 0.1}}
+TARGET = example()["targets"][0]
+MISTAKES: list[tuple[dict[str, Any], list[str]]] = [
+    ({"identty": {}}, ["'identty'", "did you mean 'identity'"]),
+    ({"sensors": {"uwb": {"kind": "range", "munt": [0.0, 0.0, 0.0]}}}, ["'sensors.uwb.munt'", "did you mean 'mount'"]),
+    ({"mavlink": {"endpoint": "x", "simulate": True}}, ["'mavlink.simulate'", "did you mean 'simulated'"]),
+    (
+        {"mavlink": {"endpoint": "x", "odometry": {"scale_trun": 1.0}}},
+        ["'mavlink.odometry.scale_trun'", "did you mean 'scale_turn'"],
+    ),
+    (
+        {"targets": [TARGET | {"start_sigma": {"position": 1.0}}]},
+        ["'targets.t1.start_sigma.position'", "did you mean 'position_m'"],
+    ),
+    ({"initial": INITIAL | {"mean": [1.0, 2.0]}}, ["'initial.mean'", "at least 3"]),
+    ({"initial": INITIAL | {"mean": [1.0, 2.0, float("nan")]}}, ["'initial.mean.2' = nan"]),
+    ({"initial": INITIAL | {"start_sigma": {"position_m": 0.5}}}, ["initial.start_sigma.heading_rad is missing"]),
+    ({"identity": {"robot": "R1"}}, ["'identity.robot' = 'R1'", "pattern"]),
+    ({"identity": {"robot": "a" * 25}}, ["'identity.robot'", "pattern"]),
+    ({"identity": {"robot": "r1", "incarnation": 0}}, ["'identity.incarnation' = 0", "greater than or equal to 1"]),
+    ({"identity": {}}, ["'identity.robot' is missing"]),
+    ({"zenoh": {"listen": "udp/127.0.0.1:1"}}, ["'zenoh.listen'", "list"]),
+    ({"zenoh": {"listen": [], "lease_ms": 1}}, ["'zenoh.lease_ms' = 1", "100"]),
+    ({"lateness": {"horizon_s": -1.0}}, ["'lateness.horizon_s' = -1.0", "greater than 0"]),
+    ({"lateness": {"kind": "hope"}}, ["'lateness.kind' = 'hope'", "'compensate' or 'discard'"]),
+    ({"state_dir": 3}, ["'state_dir' = 3", "string"]),
+    ({"version": 9}, ["'version' = 9"]),
+    ({"targets": [TARGET | {"mean": [0.0, 0.0]}]}, ["targets.t1.mean needs 4 numbers"]),
+    ({"targets": [TARGET, TARGET]}, ["'t1' is used twice"]),
+    ({"landmarks": [{"id": "L", "position": [0.0, 0.0]}] * 2}, ["'L' is used twice"]),
+    (
+        {"mavlink": {"endpoint": "x"}, "clock": {"source": "run"}},
+        ["clock.source", "mavlink.simulated = true"],
+    ),
+    ({"mavlink": {"endpoint": "x"}, "injection": {"seed": 1}}, ["[injection]", "remove it"]),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), MISTAKES, ids=[words[0] for _, words in MISTAKES])
+def test_a_mistake_is_answered_with_the_key_and_the_remedy(
+    tmp_path: Path, change: dict[str, Any], words: list[str]
+) -> None:
+    line = complaint(tmp_path, example(**change))
+    for word in words:
+        assert word in line
+
+
+def test_a_file_that_is_not_there_or_not_toml(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"gone\.toml: no such file"):
+        load_agent_config(tmp_path / "gone.toml")
+    with pytest.raises(ConfigError, match="a TOML file is needed"):
+        load_agent_config(tmp_path)
+    (tmp_path / "broken.toml").write_text("= 1")
+    with pytest.raises(ConfigError, match="not valid TOML"):
+        load_agent_config(tmp_path / "broken.toml")
+
+
+def test_a_message_is_always_one_line() -> None:
+    assert str(ConfigError("a\n  b\r\nc")) == "a b c"
