@@ -40,6 +40,8 @@ class ControlLine:
         with contextlib.suppress(OSError, ValueError):
             while line := await reader.readline():
                 message = json.loads(line)
+                if type(message) is not dict:
+                    break
                 if "start" in message and self.started is not None and not self.started.done():
                     self.started.set_result(message["start"])
                 if message.get("stop"):

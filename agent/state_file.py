@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 FILE = "state.json"
+MAX_INCARNATION = 2**53
 
 
 def next_incarnation(state_dir: Path, now_ns: int) -> int:
@@ -16,14 +17,26 @@ def next_incarnation(state_dir: Path, now_ns: int) -> int:
     from the clock in seconds, which is later than any number counted up from an earlier start.
     """
     path = state_dir / FILE
-    try:
-        number = int(json.loads(path.read_text())["incarnation"]) + 1
-    except (OSError, ValueError, KeyError, TypeError):
-        number = max(1, now_ns // 1_000_000_000)
+    last = _last(path)
+    number = last + 1 if last is not None else max(1, now_ns // 1_000_000_000)
     temporary = path.with_suffix(".tmp")
     with temporary.open("w") as file:
         json.dump({"incarnation": number}, file)
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
+    folder = os.open(state_dir, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
     return number
+
+
+def _last(path: Path) -> int | None:
+    """The number on disk; None when there is none that makes sense."""
+    try:
+        number = json.loads(path.read_text())["incarnation"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return number if type(number) is int and 1 <= number < MAX_INCARNATION else None

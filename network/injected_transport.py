@@ -44,7 +44,8 @@ class LinkInjector:
         )
         self.counters["lost" if not delays else "delivered"] += 1
         for delay in delays:
-            wait = header.t_send_ns + delay - self._now_ns()
+            # Nobody sends in the future: a stamp that says so must not hold a packet for longer than its delay.
+            wait = min(delay, header.t_send_ns + delay - self._now_ns())
             if delay == 0 or wait <= 0:
                 self._deliver(packet)
             else:
