@@ -36,7 +36,10 @@ CLOCK_STEP_NS = NS
 MAX_REPLIES = 16
 LOCAL_FRAMES = (dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_LOCAL_FRD)
 CHILD_FRAMES = (
-    dialect.MAV_FRAME_BODY_FRD, dialect.MAV_FRAME_LOCAL_FRD, dialect.MAV_FRAME_LOCAL_NED, dialect.MAV_FRAME_BODY_NED,
+    dialect.MAV_FRAME_BODY_FRD,
+    dialect.MAV_FRAME_LOCAL_FRD,
+    dialect.MAV_FRAME_LOCAL_NED,
+    dialect.MAV_FRAME_BODY_NED,
 )
 
 
@@ -263,24 +266,40 @@ class AutopilotReader:
         self._replies.clear()
         if now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = now_ns + HEARTBEAT_INTERVAL_NS
-            out.append(self._encode(
-                dialect.MAVLink_heartbeat_message(
-                    dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0,
-                    dialect.MAV_STATE_ACTIVE, 3,
+            out.append(
+                self._encode(
+                    dialect.MAVLink_heartbeat_message(
+                        dialect.MAV_TYPE_ONBOARD_CONTROLLER,
+                        dialect.MAV_AUTOPILOT_INVALID,
+                        0,
+                        0,
+                        dialect.MAV_STATE_ACTIVE,
+                        3,
+                    )
                 )
-            ))
+            )
         if self._vehicle is None:
             return out
         if now_ns >= self._sync.next_request_ns:
             out.append(self._encode(dialect.MAVLink_timesync_message(0, self._sync.request(now_ns))))
         wanted = self._requests.due(now_ns)
         if wanted is not None:
-            out.append(self._encode(
-                dialect.MAVLink_command_long_message(
-                    *self._vehicle, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0,
-                    wanted.message_id, wanted.interval_ns / 1000.0, 0.0, 0.0, 0.0, 0.0, 0.0,
+            out.append(
+                self._encode(
+                    dialect.MAVLink_command_long_message(
+                        *self._vehicle,
+                        dialect.MAV_CMD_SET_MESSAGE_INTERVAL,
+                        0,
+                        wanted.message_id,
+                        wanted.interval_ns / 1000.0,
+                        0.0,
+                        0.0,
+                        0.0,
+                        0.0,
+                        0.0,
+                    )
                 )
-            ))
+            )
         return out
 
     def next_deadline_ns(self) -> int:
@@ -419,8 +438,12 @@ class AutopilotReader:
         best = self._sync.best
         return {
             "vehicle": None if self._vehicle is None else {"system": self._vehicle[0], "component": self._vehicle[1]},
-            "timesync": None if best is None else {
-                "offset_ns": best.offset_ns, "rtt_ns": best.rtt_ns, "samples": self._sync.samples,
+            "timesync": None
+            if best is None
+            else {
+                "offset_ns": best.offset_ns,
+                "rtt_ns": best.rtt_ns,
+                "samples": self._sync.samples,
             },
             "messages": self._requests.rates(self._now_ns),
             "reasons": self._reasons(),

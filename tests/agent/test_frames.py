@@ -59,9 +59,7 @@ def test_quaternions_written_by_hand() -> None:
 
 def test_a_leg_to_the_left_of_an_eastbound_vehicle_goes_north() -> None:
     np.testing.assert_allclose(frames.from_level_body(np.array([0.0, 2.0, 0.5]), 0.0), [0.0, 2.0, 0.5], atol=1e-12)
-    np.testing.assert_allclose(
-        frames.level_body(np.array([3.0, 0.0, 0.0]), math.pi / 2), [0.0, -3.0, 0.0], atol=1e-12
-    )
+    np.testing.assert_allclose(frames.level_body(np.array([3.0, 0.0, 0.0]), math.pi / 2), [0.0, -3.0, 0.0], atol=1e-12)
 
 
 def test_metres_of_a_degree() -> None:
@@ -112,9 +110,7 @@ def test_heading_round_trips(vector: np.ndarray, heading: float) -> None:
     )
     quaternion = frames.quaternion_from_heading(heading)
     assert frames.wrap(frames.heading_from_quaternion(*quaternion) - heading) == pytest.approx(0.0, abs=1e-9)
-    np.testing.assert_allclose(
-        frames.from_level_body(frames.level_body(vector, heading), heading), vector, atol=1e-8
-    )
+    np.testing.assert_allclose(frames.from_level_body(frames.level_body(vector, heading), heading), vector, atol=1e-8)
 
 
 @given(VECTORS, ORIGINS)

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 import math
+import sys
+import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +17,9 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from agent import frames
-from sim.autopilot import StandIn, StandInSettings
+from agent.fleet_clock import FleetClock
+from network.transport import free_port
+from sim.autopilot import StandIn, StandInServer, StandInSettings
 
 S = 1_000_000_000
 BOOT = 100 * S
@@ -100,8 +107,12 @@ def test_motion_is_told_once_per_world_state_with_its_stamp() -> None:
 
 def test_a_vehicle_without_gps_knows_neither_place_nor_north() -> None:
     stand_in = vehicle(sends=("odometry", "attitude"))
-    for message_id in (dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, dialect.MAVLINK_MSG_ID_HOME_POSITION,
-                       dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN):
+    for message_id in (
+        dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+        dialect.MAVLINK_MSG_ID_HOME_POSITION,
+        dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+        dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+    ):
         assert result(stand_in.receive(BOOT, interval(message_id, 1.0))) == dialect.MAV_RESULT_DENIED
     for message_id in (dialect.MAVLINK_MSG_ID_ATTITUDE, dialect.MAVLINK_MSG_ID_GPS_RAW_INT):
         assert result(stand_in.receive(BOOT, interval(message_id, 1.0))) == dialect.MAV_RESULT_ACCEPTED
@@ -179,11 +190,69 @@ def test_wrong_settings_name_what_is_valid() -> None:
         StandInSettings(sends=("lidar",))
 
 
-@given(st.lists(st.floats(allow_nan=True, allow_infinity=True, width=32), min_size=7, max_size=7),
-       st.integers(0, 65535))
+@given(
+    st.lists(st.floats(allow_nan=True, allow_infinity=True, width=32), min_size=7, max_size=7), st.integers(0, 65535)
+)
 def test_no_command_can_hurt(parameters: list[float], number: int) -> None:
     stand_in = vehicle()
     for choice in (number, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, dialect.MAV_CMD_REQUEST_MESSAGE):
         assert names(stand_in.receive(BOOT, command(choice, *parameters)))[0] == "COMMAND_ACK"
     stand_in.outgoing(BOOT + S)
     assert stand_in.next_deadline_ns() > BOOT + S
+
+
+# -- on a socket ------------------------------------------------------------------------------------------------
+
+
+def test_a_wrong_endpoint_is_refused_with_the_valid_form() -> None:
+    with pytest.raises(ValueError, match="udpout:HOST:PORT"):
+        StandInServer(vehicle(), "tcp:127.0.0.1:5760", FleetClock())
+
+
+def test_mavsdk_finds_the_vehicle_and_reads_it() -> None:
+    """An independent implementation sets the rates and reads place, attitude, home and health."""
+    found = asyncio.run(judged(free_port()))
+    assert found["system"] == 3
+    np.testing.assert_allclose(
+        frames.geodetic_to_enu(found["lat"], found["lon"], found["alt"], ORIGIN), [30.0, 40.0, 2.0], atol=0.02
+    )
+    assert frames.heading_from_yaw(math.radians(found["yaw_deg"])) == pytest.approx(0.5, abs=1e-4)
+    np.testing.assert_allclose([found["north_m"], found["east_m"]], [0.0, 0.0], atol=0.01)
+    assert found["home_lat"] == pytest.approx(found["lat"], abs=1e-6)
+    assert found["health"]["is_global_position_ok"] and found["health"]["is_home_position_ok"]
+
+
+async def judged(port: int) -> dict[str, Any]:
+    clock = FleetClock(0, time.monotonic_ns())
+    settings = StandInSettings(system_id=3, sends=GPS, origin=ORIGIN, boot_ns=-5 * S)
+    server = StandInServer(StandIn(settings), f"udpout:127.0.0.1:{port}", clock)
+    await server.start()
+    judge = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-P",
+        str(Path(__file__).with_name("mavsdk_judge.py")),
+        str(port),
+        stdout=asyncio.subprocess.PIPE,
+    )
+
+    async def drive() -> None:
+        while True:
+            now = clock.now_ns()
+            server.stand_in.set_odometry(now, np.zeros(4))
+            server.stand_in.set_fix(now, 30.0, 40.0, 2.0, 0.5)
+            server.push(now)
+            await asyncio.sleep(0.05)
+
+    driving = asyncio.create_task(drive())
+    try:
+        output, _ = await judge.communicate()
+    finally:
+        driving.cancel()
+        if judge.returncode is None:
+            judge.kill()
+            await judge.wait()
+        await server.close()
+    assert judge.returncode == 0
+    # The library logs to standard output as well.
+    found: dict[str, Any] = json.loads(output.decode().strip().splitlines()[-1])
+    return found
