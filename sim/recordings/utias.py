@@ -1,15 +1,17 @@
 """Loader of a UTIAS MR.CLAM folder (Leung et al. 2011): five robots, fifteen landmarks, Vicon ground truth.
 
-Files are plain `.dat` or `.dat.xz`. Stamps become integer nanoseconds exactly. The measurement files hold barcode
-numbers, whatever their header says; each folder's own Barcodes.dat turns them into subjects. Subjects 1-5 are the
-robots `r1`-`r5`, 6-20 the landmarks `L6`-`L20`.
+Files are plain `.dat` or `.dat.xz`. Stamps become integer nanoseconds exactly, from the digits. The measurement files
+hold barcode numbers, whatever their header says; each folder's own Barcodes.dat turns them into subjects. Subjects 1-5
+are the robots `r1`-`r5`, 6-20 the landmarks `L6`-`L20`. Stamps are Unix time; the shift to time since the start is
+`Recording.start_ns`.
 """
 
 from __future__ import annotations
 
 import lzma
+import math
+import re
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,6 +26,9 @@ Stamps = NDArray[np.int64]
 
 ROBOT_SUBJECTS = range(1, 6)
 START_MARGIN_NS = 5_000_000_000
+REMEDY = "give the path of an unpacked MR.CLAM data set"
+CUT = "the file is cut or altered; fetch it again"
+SECONDS = re.compile(r"([0-9]{1,10})(?:\.([0-9]*))?")
 
 
 class RecordingError(ValueError):
@@ -72,28 +77,52 @@ class RobotRecording:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """A whole folder. [start_ns, end_ns] is the span all robots have in common."""
+    """A whole folder. [start_ns, end_ns] is the span all robots have in common.
+
+    start_ns: 5 s after the last robot's first truth; end_ns: the first robot's last truth. A robot without truth
+    counts with its odometry. `left_out` names robots whose odometry or measurement file is missing; `counters`
+    says what was dropped and why.
+    """
 
     robots: dict[str, RobotRecording]
     landmarks: dict[str, tuple[float, float]]
     start_ns: int
     end_ns: int
     counters: Counter[str] = field(default_factory=Counter)
+    left_out: tuple[str, ...] = ()
+
+    def _robot(self, name: str) -> RobotRecording:
+        if name not in self.robots:
+            raise RecordingError(f"the recording has no robot {name!r}; it has {', '.join(self.robots)}")
+        return self.robots[name]
 
     def truth_at(self, robot: str, t_ns: int) -> Array:
-        """True pose (3,) interpolated linearly, heading wrapped. Raises `RecordingError` without truth."""
-        truth = self.robots[robot].truth
+        """True pose (3,) interpolated linearly, heading wrapped.
+
+        Raises `RecordingError` without truth, and outside its span: a pose there would be invented.
+        """
+        truth = self._robot(robot).truth
         if truth is None:
             raise RecordingError(f"the recording has no ground truth of {robot}")
-        at = float(t_ns - int(truth.t_ns[0]))
-        base = (truth.t_ns - truth.t_ns[0]).astype(np.float64)
-        pose = np.array([np.interp(at, base, truth.pose[:, column]) for column in range(3)])
+        first, last = int(truth.t_ns[0]), int(truth.t_ns[-1])
+        if not first <= t_ns <= last:
+            raise RecordingError(f"{robot}: no ground truth at {t_ns} ns; it spans [{first}, {last}]")
+        index = max(int(np.searchsorted(truth.t_ns, t_ns)), 1)
+        if len(truth.t_ns) == 1:
+            pose = truth.pose[0].copy()
+        else:
+            before, after = int(truth.t_ns[index - 1]), int(truth.t_ns[index])
+            share = (t_ns - before) / (after - before)
+            pose = truth.pose[index - 1] + share * (truth.pose[index] - truth.pose[index - 1])
         pose[2] = wrap(pose[2])
-        return pose
+        return np.asarray(pose)
 
     def increment(self, robot: str, t0_ns: int, t1_ns: int) -> Array:
-        """Odometry (dx, dy, dyaw) over [t0, t1] in the body frame at t0, from held commands."""
-        odometry = self.robots[robot].odometry
+        """Odometry (dx, dy, dyaw) over [t0, t1] in the body frame at t0: held commands, integrated as arcs.
+
+        Before its first command a robot stands; its last one is held on.
+        """
+        odometry = self._robot(robot).odometry
         return between(_integrated(odometry, t0_ns), _integrated(odometry, t1_ns))
 
 
@@ -101,27 +130,32 @@ def load(path: str | Path) -> Recording:
     """Read a folder. Raises `RecordingError` naming the file (and line) and the remedy."""
     folder = Path(path)
     if not folder.is_dir():
-        raise RecordingError(f"{folder}: no such folder; give the path of an unpacked MR.CLAM data set")
+        raise RecordingError(f"{folder}: no such folder; {REMEDY}")
     counters: Counter[str] = Counter()
-    barcodes = {int(code): int(subject) for subject, code in _rows(folder, "Barcodes", 2)}
-    landmarks = {f"L{int(row[0])}": (row[1], row[2]) for row in _numbers(folder, "Landmark_Groundtruth", 5)}
-    robots = {}
+    barcodes = _barcodes(folder)
+    places = _table(folder, "Landmark_Groundtruth", 5)
+    landmarks = {
+        f"L{subject}": (float(row[1]), float(row[2])) for subject, row in zip(_integers(places, 0), places.values)
+    }
+    robots, left_out = {}, []
     for number in ROBOT_SUBJECTS:
+        name = f"r{number}"
         if _find(folder, f"Robot{number}_Odometry") is None or _find(folder, f"Robot{number}_Measurement") is None:
-            counters["robot_files_missing"] += 1
+            left_out.append(name)
             continue
         has_truth = _find(folder, f"Robot{number}_Groundtruth") is not None
-        robots[f"r{number}"] = RobotRecording(
+        robots[name] = RobotRecording(
             _odometry(folder, number, counters),
-            _sightings(folder, number, barcodes, counters),
-            _truth(folder, number) if has_truth else None,
+            _sightings(folder, number, barcodes, landmarks, counters),
+            _truth(folder, number, counters) if has_truth else None,
         )
     if not robots:
-        raise RecordingError(f"{folder}: no Robot*_Odometry.dat; give the path of an unpacked MR.CLAM data set")
+        raise RecordingError(f"{folder}: no robot has both an odometry and a measurement file; {REMEDY}")
+    counters["robot_files_missing"] = len(left_out)
     start_ns, end_ns = _span(robots)
     if end_ns <= start_ns:
-        raise RecordingError(f"{folder}: the robots' files have no common span of time")
-    return Recording(robots, landmarks, start_ns, end_ns, counters)
+        raise RecordingError(f"{folder}: the robots' files have no common span of time; take them from one run")
+    return Recording(robots, landmarks, start_ns, end_ns, counters, tuple(left_out))
 
 
 def _span(robots: dict[str, RobotRecording]) -> tuple[int, int]:
@@ -136,67 +170,104 @@ def _find(folder: Path, name: str) -> Path | None:
     return None
 
 
-def _rows(folder: Path, name: str, columns: int) -> Iterator[tuple[str, ...]]:
-    """Fields of each line. Raises `RecordingError` for a missing or cut file or a short line."""
-    path = _find(folder, name)
-    if path is None:
-        raise RecordingError(f"{folder}: {name}.dat is missing; give the path of an unpacked MR.CLAM data set")
+@dataclass(frozen=True, slots=True, eq=False)
+class _Table:
+    """A file's data lines: their numbers, the first field as text, and all fields as numbers (K, columns)."""
+
+    path: Path
+    lines: list[int]
+    first: list[str]
+    values: Array
+
+    def wrong(self, row: int, what: str) -> RecordingError:
+        return RecordingError(f"{self.path}, line {self.lines[row]}: {what}; {CUT}")
+
+
+def _text(path: Path) -> str:
     try:
         raw = path.read_bytes()
-        text = (lzma.decompress(raw) if path.suffix == ".xz" else raw).decode()
+        return (lzma.decompress(raw) if path.suffix == ".xz" else raw).decode()
     except (EOFError, lzma.LZMAError):
         raise RecordingError(f"{path}: the compressed file is cut or damaged; fetch it again") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: cannot be read ({error.__class__.__name__})") from None
-    for number, line in enumerate(text.splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
+        raise RecordingError(f"{path}: cannot be read ({error.__class__.__name__}); fetch it again") from None
+
+
+def _table(folder: Path, name: str, columns: int) -> _Table:
+    """Raises `RecordingError` for a missing or cut file, a line of other width, and what is not a finite number."""
+    path = _find(folder, name)
+    if path is None:
+        raise RecordingError(f"{folder}: {name}.dat is missing; {REMEDY}")
+    lines, first, numbers = [], [], []
+    for number, line in enumerate(_text(path).splitlines(), start=1):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
             continue
-        fields = tuple(line.split())
         if len(fields) != columns:
-            raise RecordingError(
-                f"{path}, line {number}: {len(fields)} columns instead of {columns}; the file is cut or altered"
-            )
-        for item in fields:
-            if not _is_number(item):
-                raise RecordingError(f"{path}, line {number}: not a number; the file is cut or altered")
-        yield fields
+            raise RecordingError(f"{path}, line {number}: {len(fields)} columns instead of {columns}; {CUT}")
+        try:
+            row = [float(item) for item in fields]
+        except ValueError:
+            raise RecordingError(f"{path}, line {number}: not a number; {CUT}") from None
+        lines.append(number)
+        first.append(fields[0])
+        numbers.append(row)
+    table = _Table(path, lines, first, np.array(numbers, dtype=np.float64).reshape(len(numbers), columns))
+    bad = np.flatnonzero(~np.isfinite(table.values).all(axis=1))
+    if len(bad):
+        raise table.wrong(int(bad[0]), "not a finite number")
+    return table
 
 
-def _is_number(text: str) -> bool:
-    try:
-        return bool(np.isfinite(float(text)))
-    except ValueError:
-        return False
+def _integers(table: _Table, column: int) -> list[int]:
+    values = table.values[:, column]
+    bad = np.flatnonzero(values != np.rint(values))
+    if len(bad):
+        raise table.wrong(int(bad[0]), "a subject or barcode is not a whole number")
+    return [int(value) for value in values]
 
 
-def _numbers(folder: Path, name: str, columns: int) -> list[list[float]]:
-    return [[float(item) for item in row] for row in _rows(folder, name, columns)]
+def _barcodes(folder: Path) -> dict[int, int]:
+    """Subject of each code."""
+    table = _table(folder, "Barcodes", 2)
+    found: dict[int, int] = {}
+    for row, (subject, code) in enumerate(zip(_integers(table, 0), _integers(table, 1))):
+        if code in found:
+            raise table.wrong(row, f"code {code} stands for two subjects")
+        found[code] = subject
+    return found
 
 
-def _nanoseconds(text: str) -> int:
-    """Decimal seconds as integer nanoseconds, digit by digit: a float would lose a tenth of a microsecond."""
-    whole, _, fraction = text.partition(".")
-    if not whole.isdigit() or (fraction and not fraction.isdigit()):
-        return round(float(text) * 1_000_000_000)
-    return int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, "0") or "0")
+def _stamped(folder: Path, name: str, columns: int, counters: Counter[str]) -> tuple[Stamps, _Table, NDArray[np.intp]]:
+    """Stamps in order of time, the table, and the row of each stamp.
 
-
-def _stamped(folder: Path, name: str, columns: int) -> tuple[Stamps, list[tuple[str, ...]]]:
-    rows = list(_rows(folder, name, columns))
-    if not rows:
-        raise RecordingError(f"{folder}: {name}.dat holds no data")
-    stamps = np.array([_nanoseconds(row[0]) for row in rows], dtype=np.int64)
+    Digits below a nanosecond are dropped. A float of Unix seconds would be off by a tenth of a microsecond.
+    """
+    table = _table(folder, name, columns)
+    stamps = np.empty(len(table.first), dtype=np.int64)
+    for row, text in enumerate(table.first):
+        match = SECONDS.fullmatch(text)
+        if match is None:
+            raise table.wrong(row, "not a time in decimal seconds")
+        whole, fraction = match.groups(default="")
+        stamps[row] = int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
+    counters["stamps_out_of_order"] += int(np.sum(np.diff(stamps) < 0))
     order = np.argsort(stamps, kind="stable")
-    return stamps[order], [rows[index] for index in order]
+    return stamps[order], table, order
+
+
+def _motion(folder: Path, name: str, columns: int, counters: Counter[str], repeated: str) -> tuple[Stamps, Array]:
+    """Strictly increasing stamps and the columns beside them; of repeated stamps the last line holds."""
+    stamps, table, order = _stamped(folder, name, columns, counters)
+    if not len(stamps):
+        raise RecordingError(f"{table.path}: holds no data; {CUT}")
+    keep = np.append(np.diff(stamps) > 0, True)
+    counters[repeated] += int(np.sum(~keep))
+    return stamps[keep], table.values[order, 1:][keep]
 
 
 def _odometry(folder: Path, number: int, counters: Counter[str]) -> Odometry:
-    stamps, rows = _stamped(folder, f"Robot{number}_Odometry", 3)
-    values = np.array([[float(row[1]), float(row[2])] for row in rows])
-    # Of repeated stamps the last command holds.
-    keep = np.append(np.diff(stamps) > 0, True)
-    counters["odometry_stamps_repeated"] += int(np.sum(~keep))
-    stamps, values = stamps[keep], values[keep]
+    stamps, values = _motion(folder, f"Robot{number}_Odometry", 3, counters, "odometry_stamps_repeated")
     dt = np.diff(stamps) * 1e-9
     turn = values[:-1, 1] * dt
     pose = np.zeros((len(stamps), 3))
@@ -206,45 +277,45 @@ def _odometry(folder: Path, number: int, counters: Counter[str]) -> Odometry:
     return Odometry(stamps, values[:, 0], values[:, 1], pose)
 
 
-def _arc(pose: Array, v: float, w: float, dt: float) -> Array:
-    """Pose after driving an arc for dt seconds."""
-    turn = w * dt
-    chord = v * dt * float(np.sinc(turn / 2.0 / np.pi))
-    middle = pose[2] + turn / 2.0
-    return np.array([pose[0] + chord * np.cos(middle), pose[1] + chord * np.sin(middle), pose[2] + turn])
-
-
 def _integrated(odometry: Odometry, t_ns: int) -> Array:
+    """Integral (3,) of the commands from the first stamp to t."""
     index = int(np.searchsorted(odometry.t_ns, t_ns, side="right")) - 1
     if index < 0:
         return np.asarray(odometry.pose[0])
     dt = (t_ns - int(odometry.t_ns[index])) * 1e-9
-    return _arc(odometry.pose[index], float(odometry.v_mps[index]), float(odometry.w_radps[index]), dt)
+    x, y, heading = (float(value) for value in odometry.pose[index])
+    half = float(odometry.w_radps[index]) * dt / 2.0
+    chord = float(odometry.v_mps[index]) * dt * (math.sin(half) / half if half else 1.0)
+    return np.array([x + chord * math.cos(heading + half), y + chord * math.sin(heading + half), heading + 2.0 * half])
 
 
-def _sightings(folder: Path, number: int, barcodes: dict[int, int], counters: Counter[str]) -> Sightings:
-    stamps, rows = _stamped(folder, f"Robot{number}_Measurement", 4)
-    subjects, kept = [], []
-    for index, row in enumerate(rows):
-        subject = barcodes.get(int(float(row[1])))
+def _sightings(
+    folder: Path,
+    number: int,
+    barcodes: dict[int, int],
+    landmarks: dict[str, tuple[float, float]],
+    counters: Counter[str],
+) -> Sightings:
+    stamps, table, order = _stamped(folder, f"Robot{number}_Measurement", 4, counters)
+    codes = _integers(table, 1)
+    subjects: list[str] = []
+    kept: list[int] = []
+    for index, row in enumerate(order):
+        subject = barcodes.get(codes[row])
         if subject is None:
             counters["unknown_codes"] += 1
         elif subject == number:
             counters["own_codes"] += 1
+        elif subject not in ROBOT_SUBJECTS and f"L{subject}" not in landmarks:
+            counters["unknown_landmarks"] += 1
         else:
             subjects.append(f"r{subject}" if subject in ROBOT_SUBJECTS else f"L{subject}")
             kept.append(index)
-    return Sightings(
-        stamps[kept],
-        tuple(subjects),
-        np.array([float(rows[index][2]) for index in kept]),
-        np.array([float(rows[index][3]) for index in kept]),
-    )
+    use = np.array(kept, dtype=np.intp)
+    return Sightings(stamps[use], tuple(subjects), table.values[order[use], 2], table.values[order[use], 3])
 
 
-def _truth(folder: Path, number: int) -> Truth:
-    stamps, rows = _stamped(folder, f"Robot{number}_Groundtruth", 4)
-    pose = np.array([[float(item) for item in row[1:]] for row in rows])
+def _truth(folder: Path, number: int, counters: Counter[str]) -> Truth:
+    stamps, pose = _motion(folder, f"Robot{number}_Groundtruth", 4, counters, "truth_stamps_repeated")
     pose[:, 2] = np.unwrap(pose[:, 2])
-    keep = np.append(np.diff(stamps) > 0, True)
-    return Truth(stamps[keep], pose[keep])
+    return Truth(stamps, pose)
