@@ -82,7 +82,7 @@ class Agent:
             covered = self._covered(item.t_ns)
             wait = lateness.settle_ns if covered else max(lateness.odometry_wait_ns, lateness.settle_ns)
             deadline = min(deadline, item.t_ns + wait)
-        end = self._odometry.next_end_ns()
+        end = self._odometry.next_end_ns(self.state.t_ns)
         if end is not None:
             deadline = min(deadline, end + lateness.settle_ns)
         return max(deadline, self.now_ns)
@@ -175,18 +175,23 @@ class Agent:
                 self._process(item, effects)
             except np.linalg.LinAlgError:
                 self.counters["update.failed"] += 1
-        while (end := self._odometry.next_end_ns()) is not None and end <= settled + lateness.tolerance_ns:
+        while (end := self._odometry.next_end_ns(self.state.t_ns)) is not None:
             waiting = self._timeline.peek()
-            if waiting is not None and waiting.t_ns < end - lateness.tolerance_ns:
+            if end > settled + lateness.tolerance_ns or (
+                waiting is not None and waiting.t_ns < end - lateness.tolerance_ns
+            ):
                 break
-            self._advance(end)
+            self._step(end)
 
     def _advance(self, until_ns: int) -> None:
-        tolerance = self.settings.lateness.tolerance_ns
-        while self.state.t_ns < until_ns - tolerance:
-            t_ns, delta, cov = self._odometry.step(self.state.t_ns, until_ns)
-            self.state, F = moved(self.settings, self.state, t_ns, delta, cov)
-            self.history.advanced(self.state, delta, cov, F)
+        while self.state.t_ns < until_ns - self.settings.lateness.tolerance_ns:
+            self._step(until_ns)
+
+    def _step(self, until_ns: int) -> None:
+        """Move the state one stretch of odometry, or of coasting, towards `until_ns` > its instant."""
+        t_ns, delta, cov = self._odometry.step(self.state.t_ns, until_ns)
+        self.state, F = moved(self.settings, self.state, t_ns, delta, cov)
+        self.history.advanced(self.state, delta, cov, F)
 
     # -- one instant ----------------------------------------------------------------------------------------
 

@@ -78,9 +78,14 @@ class OdometryTrack:
         """Last instant covered by a waiting increment; None when there is none."""
         return self._increments[-1].t_meas_ns if self._increments else None
 
-    def next_end_ns(self) -> int | None:
-        """End of the first waiting increment."""
+    def next_end_ns(self, state_ns: int) -> int | None:
+        """End of the first waiting increment that reaches beyond `state_ns`."""
+        self._drop_used(state_ns)
         return self._increments[0].t_meas_ns if self._increments else None
+
+    def _drop_used(self, state_ns: int) -> None:
+        while self._increments and self._increments[0].t_meas_ns <= state_ns:
+            self._increments.popleft()
 
     def add(self, odometry: Odometry, state_ns: int) -> None:
         """Take an increment; one that ends in the past, or before the previous one, is counted and dropped."""
@@ -97,11 +102,11 @@ class OdometryTrack:
         """The next stretch from `state_ns` towards `until_ns` > state_ns: (its end, delta (4,), cov (4, 4)).
 
         It ends at the end of an increment, at `until_ns`, or where a gap ends. Without odometry the stretch
-        is a coast: zero motion with the covariance of an unknown constant velocity.
+        is a coast: zero motion with the covariance of an unknown constant velocity. The end always lies beyond
+        `state_ns`.
         """
         tolerance = self._tolerance_ns
-        while self._increments and self._increments[0].t_meas_ns <= state_ns:
-            self._increments.popleft()
+        self._drop_used(state_ns)
         if not self._increments or self._increments[0].t0_ns >= until_ns:
             return self._coasted(state_ns, until_ns)
         increment = self._increments[0]

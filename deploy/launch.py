@@ -34,6 +34,7 @@ from sim.world import World
 READY_TIMEOUT_S = 30.0
 LEAD_S = 2.0
 STOP_TIMEOUT_S = 15.0
+SILENT_S = 10.0
 WORLD = "world"
 
 # What the scheduling of one computer costs, in wall time: data of an instant are waited for so long, and stamps
@@ -58,6 +59,7 @@ class Member:
     status: dict[str, Any] = field(default_factory=dict)
     done: dict[str, Any] | None = None
     exit_code: int | None = None
+    heard_s: float = 0.0
     reaper: asyncio.Task[None] | None = None
 
 
@@ -235,6 +237,7 @@ class Launcher:
                 if member is None:
                     continue
                 member.writer = writer
+                member.heard_s = time.monotonic()
                 member.ready = member.ready or "ready" in message
                 if "status" in message:
                     member.status = message["status"]
@@ -268,19 +271,26 @@ class Launcher:
             if world.exit_code is not None:
                 raise LaunchError(f"the world {describe_exit(world.exit_code)}: {last_line(world.log)}")
             for member in self.members.values():
-                if member.exit_code is not None and member.name not in reported:
+                told = self._trouble(member)
+                if told is not None and member.name not in reported:
                     reported.append(member.name)
                     at = self.progress() * self._scenario.duration_s
-                    reason = last_line(member.log)
-                    told = f": {reason}" if reason else ""
-                    self.messages.append(
-                        f"{member.name} {describe_exit(member.exit_code)} at about {at:.0f} s{told}; the others go on"
-                    )
+                    self.messages.append(f"{member.name} {told} at about {at:.0f} s; the others go on")
             if show is not None:
                 show(self)
             await self._wait(0.25)
         if show is not None:
             show(self)
+
+    @staticmethod
+    def _trouble(member: Member) -> str | None:
+        """What is wrong with a process, if anything."""
+        if member.exit_code is not None:
+            reason = last_line(member.log)
+            return describe_exit(member.exit_code) + (f" ({reason})" if reason else "")
+        if time.monotonic() - member.heard_s > SILENT_S:
+            return f"has not answered for {SILENT_S:.0f} s"
+        return None
 
     async def _wait(self, seconds: float) -> None:
         self._changed.clear()
@@ -306,6 +316,8 @@ class Launcher:
         for number in (signal.SIGTERM, signal.SIGKILL):
             for member in order:
                 if member.exit_code is None:
+                    if number == signal.SIGKILL:
+                        self.messages.append(f"{member.name} did not stop when told to and was killed")
                     with contextlib.suppress(ProcessLookupError):
                         member.process.send_signal(number)
             await self._all_gone(3.0)
