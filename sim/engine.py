@@ -180,7 +180,7 @@ class VirtualEngine:
             outputs = self._world.outputs(k)
             for item in outputs:
                 self._push(item.t_ns, int(item.phase), item.robot, item)
-            self._play((k - 1) * self._world.step_ns, k)
+            self._play(k)
             self.step_us.append((time.perf_counter() - started) * 1e6 / len(self._nodes))
             if self._bound is not None:
                 self._bound.step(k, outputs)
@@ -189,7 +189,7 @@ class VirtualEngine:
                 progress(k, self._world.steps)
         return self._result()
 
-    def _play(self, from_ns: int, k: int) -> None:
+    def _play(self, k: int) -> None:
         """Everything up to and including instant k. Who hears whom follows the positions at each instant."""
         end = k * self._world.step_ns
         while self._heap and self._heap[0][0] <= end:
