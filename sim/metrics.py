@@ -1,8 +1,8 @@
 """Figures of one trial and of many: RMSE, NEES, containment, and what of them goes into `summary.json`.
 
-A trial is reduced to a few sums (`reduce_trial`), which combine in the order of the trials into the same figures
-whatever processes made them. NEES is per degree of freedom (ideal 1). An instant without an estimate (NaN) is
-left out.
+A trial is reduced to a few sums (`reduce_trial`). `combine` adds them up in the order of the trials, so the figures are
+the same to the last bit whatever processes made them. NEES is per degree of freedom (ideal 1). An instant without an
+estimate (NaN) is left out.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import wrap
+from agent.estimation.gaussian import is_positive_definite, quadratic_form, wrap
 
 Array = NDArray[np.float64]
 Window = tuple[float, float]
@@ -54,82 +54,117 @@ def errors(trace: StateTrace) -> Array:
 
 
 def nees(trace: StateTrace) -> Array:
-    """Normalized estimation error squared per degree of freedom (K,); NaN where there is no estimate."""
+    """Normalized estimation error squared per degree of freedom, e' P^-1 e / n (K,).
+
+    NaN where there is no estimate, and where a covariance is not positive definite: no distance is measured with it.
+    """
     error = errors(trace)
     values = np.full(len(error), np.nan)
-    valid = np.isfinite(error).all(axis=1)
-    if valid.any():
-        solved = np.linalg.solve(trace.cov[valid], error[valid][..., None])[..., 0]
-        values[valid] = np.sum(error[valid] * solved, axis=1) / error.shape[1]
+    rows = np.flatnonzero(np.isfinite(error).all(axis=1))
+    rows = rows[_positive_definite(trace.cov[rows])]
+    if len(rows):
+        values[rows] = quadratic_form(error[rows], trace.cov[rows]) / error.shape[1]
     return values
 
 
-def _reduced(trace: StateTrace, inside: NDArray[np.bool_]) -> dict[str, Any]:
-    """Sums over the window: count, squared errors, NEES, containment, maxima, last error."""
+def _positive_definite(cov: Array) -> NDArray[np.bool_]:
+    """Which of the matrices (K, n, n) are finite and positive definite."""
+    usable: NDArray[np.bool_] = np.asarray(np.isfinite(cov).all(axis=(1, 2)))
+    try:
+        np.linalg.cholesky(cov[usable])
+    except np.linalg.LinAlgError:
+        usable[usable] = [is_positive_definite(matrix) for matrix in cov[usable]]
+    return usable
+
+
+def _reduced(trace: StateTrace, inside: NDArray[np.bool_], stride: int) -> dict[str, Any]:
+    """Counts and sums over the window, maxima, last error, and every `stride`-th sample for the series.
+
+    `heading` and `velocity` are sums of squares, None for a state that has no such components.
+    """
     error, ratio = errors(trace), nees(trace)
-    use = inside & np.isfinite(ratio)
+    squared = error[:, 0] ** 2 + error[:, 1] ** 2
+    seen = np.isfinite(error).all(axis=1)
+    use = inside & seen
     within = error[use]
-    sigma = np.sqrt(np.diagonal(trace.cov, axis1=1, axis2=2)[use])
-    squared = within[:, 0] ** 2 + within[:, 1] ** 2
-    rest = within[:, 2:]
-    present = np.flatnonzero(np.isfinite(error[:, 0]))
+    sigma = np.sqrt(np.maximum(np.diagonal(trace.cov, axis1=1, axis2=2)[use], 0.0))
+    velocity = [index for index in range(2, error.shape[1]) if index not in trace.angles]
+    usable = use & np.isfinite(ratio)
+    present = np.flatnonzero(seen)
     return {
         "count": int(use.sum()),
-        "position": float(squared.sum()),
-        "rest": float(np.sum(rest**2)),
-        "heading": bool(trace.angles),
-        "nees": float(ratio[use].sum()),
-        "inside": float(np.sum(np.abs(within) <= 3.0 * sigma)) / within.shape[1] if len(within) else 0.0,
-        "max_position": float(np.sqrt(squared.max())) if len(squared) else None,
+        "position": float(squared[use].sum()),
+        "heading": float(np.sum(within[:, list(trace.angles)] ** 2)) if trace.angles else None,
+        "velocity": float(np.sum(within[:, velocity] ** 2)) if velocity else None,
+        "nees_count": int(usable.sum()),
+        "nees": float(ratio[usable].sum()),
+        "inside": float(np.sum(np.abs(within) <= 3.0 * sigma)) / error.shape[1],
+        "max_position": float(np.sqrt(squared[use].max())) if len(within) else None,
         "max": [float(value) for value in np.abs(within).max(axis=0)] if len(within) else None,
-        "final": float(np.hypot(*error[present[-1], :2])) if len(present) else None,
-        "series": (error[:, 0] ** 2 + error[:, 1] ** 2).astype(np.float64),
-        "nees_series": ratio,
+        "final": float(np.sqrt(squared[present[-1]])) if len(present) else None,
+        "series": np.where(seen, squared, np.nan)[::stride],
+        "nees_series": ratio[::stride],
     }
 
 
 def reduce_trial(trace: TrialTrace, window_s: Window) -> dict[str, Any]:
-    """What is kept of a trial."""
+    """What is kept of a trial: sums over the window, and series of at most `MAX_SERIES` instants."""
     inside = (trace.t_s >= window_s[0] - 1e-9) & (trace.t_s <= window_s[1] + 1e-9)
     stride = max(1, -(-len(trace.t_s) // MAX_SERIES))
 
-    def state(item: StateTrace) -> dict[str, Any]:
-        found = _reduced(item, inside)
-        found["series"], found["nees_series"] = found["series"][::stride], found["nees_series"][::stride]
+    def states(items: dict[str, StateTrace], *, ratios: bool = False) -> dict[str, Any]:
+        found = {name: _reduced(item, inside, stride) for name, item in items.items()}
+        if not ratios:
+            for entry in found.values():
+                del entry["nees_series"]
         return found
 
     return {
         "t_s": trace.t_s[::stride],
-        "robots": {name: state(item) for name, item in trace.robots.items()},
-        "targets": {
-            target: {name: state(item) for name, item in owners.items()} for target, owners in trace.targets.items()
-        },
-        "bound": None
-        if trace.bound is None
-        else {group: {name: state(item) for name, item in items.items()} for group, items in trace.bound.items()},
+        "robots": states(trace.robots, ratios=True),
+        "targets": {target: states(owners) for target, owners in trace.targets.items()},
+        "bound": None if trace.bound is None else {group: states(items) for group, items in trace.bound.items()},
     }
 
 
-def _beliefs(reduced: dict[str, Any]) -> list[dict[str, Any]]:
-    return [
-        *reduced["robots"].values(),
-        *(item for owners in reduced["targets"].values() for item in owners.values()),
-    ]
+def summarize(traces: Sequence[TrialTrace], window_s: Window, lost_above_m: float) -> dict[str, Any]:
+    """Figures of trials at hand as a whole; `reduce_trial` and `combine` in one."""
+    return combine([reduce_trial(trace, window_s) for trace in traces], lost_above_m)
+
+
+def _tracks(reduced: dict[str, Any]) -> list[dict[str, Any]]:
+    """Target beliefs of a trial; the bound has one per target, the fleet one per target and robot."""
+    tracks = []
+    for item in reduced["targets"].values():
+        tracks += [item] if "count" in item else list(item.values())
+    return tracks
+
+
+def _ratio(items: Sequence[dict[str, Any]], key: str, count: str = "count") -> float | None:
+    """Sum of `key` over the samples of those that have it, None without samples."""
+    known = [item for item in items if item[key] is not None]
+    total = sum(item[count] for item in known)
+    return float(sum(item[key] for item in known) / total) if total else None
 
 
 def _rmse(items: Sequence[dict[str, Any]], key: str = "position") -> float | None:
-    count = sum(item["count"] for item in items)
-    return float(np.sqrt(sum(item[key] for item in items) / count)) if count else None
+    mean = _ratio(items, key)
+    return None if mean is None else float(np.sqrt(mean))
 
 
-def _mean(items: Sequence[dict[str, Any]], key: str) -> float | None:
-    count = sum(item["count"] for item in items)
-    return float(sum(item[key] for item in items) / count) if count else None
+def _anees(items: Sequence[dict[str, Any]]) -> float | None:
+    return _ratio(items, "nees", "nees_count")
 
 
-def is_lost(items: Sequence[dict[str, Any]], lost_above_m: float) -> bool:
-    """Whether any of a trial's beliefs has a position RMSE above the limit, or no estimate at all."""
-    return any(item["count"] == 0 or np.sqrt(item["position"] / item["count"]) > lost_above_m for item in items)
+def is_lost(reduced: dict[str, Any], lost_above_m: float) -> bool:
+    """Whether a belief's position RMSE over the window is above the limit, or a robot has no estimate in it.
+
+    A target nobody has told a robot of is no belief, hence not a lost one.
+    """
+    robots = list(reduced["robots"].values())
+    return any(item["count"] == 0 for item in robots) or any(
+        item["position"] > lost_above_m**2 * item["count"] for item in [*robots, *_tracks(reduced)]
+    )
 
 
 def _median(values: Sequence[float | None]) -> float | None:
@@ -138,26 +173,27 @@ def _median(values: Sequence[float | None]) -> float | None:
 
 
 def _entity(items: Sequence[dict[str, Any]], robot: bool) -> dict[str, Any]:
-    """Figures of one robot, or of one robot's track of one target, over trials."""
-    heading = bool(items) and items[0]["heading"]
+    """Figures of one robot, or of one robot's track of one target, over trials.
+
+    RMSE, `anees` and `containment_3sigma` (the share of components within three of their standard deviations) are
+    over all samples of all trials, `position_error_max_m` is the largest of all; `final_position_error_m` and
+    `error_max` are medians over trials of the last error and of each component's largest.
+    """
     figures: dict[str, Any] = {"position_rmse_m": _rmse(items)}
-    if heading:
-        figures["heading_rmse_rad"] = _rmse(items, "rest")
-    elif not robot:
-        figures["velocity_rmse_mps"] = _rmse(items, "rest")
+    for key, name in (("heading", "heading_rmse_rad"), ("velocity", "velocity_rmse_mps")):
+        if items[0][key] is not None:
+            figures[name] = _rmse(items, key)
     if robot:
-        figures["position_error_max_m"] = max(
-            (i["max_position"] for i in items if i["max_position"] is not None), default=None
-        )
+        largest = [item["max_position"] for item in items if item["max_position"] is not None]
+        figures["position_error_max_m"] = max(largest, default=None)
         figures["final_position_error_m"] = _median([item["final"] for item in items])
-    figures["anees"] = _mean(items, "nees")
-    figures["containment_3sigma"] = _mean(items, "inside")
+    figures["anees"] = _anees(items)
+    figures["containment_3sigma"] = _ratio(items, "inside")
     if robot:
-        names = ("x_m", "y_m", "heading_rad")
+        names = ("x_m", "y_m", "heading_rad") if items[0]["heading"] is not None else ("x_m", "y_m")
         figures["error_max"] = {
             name: _median([item["max"][index] for item in items if item["max"] is not None])
             for index, name in enumerate(names)
-            if heading or index < 2
         }
     return figures
 
@@ -168,19 +204,11 @@ def fleet_figures(trials: Sequence[dict[str, Any]]) -> dict[str, Any]:
     tracks = [item for trial in trials for item in _tracks(trial)]
     return {
         "position_rmse_m": _rmse(robots),
-        "heading_rmse_rad": _rmse(robots, "rest"),
-        "anees": _mean(robots, "nees"),
+        "heading_rmse_rad": _rmse(robots, "heading"),
+        "anees": _anees(robots),
         "target_position_rmse_m": _rmse(tracks),
-        "target_anees": _mean(tracks, "nees"),
+        "target_anees": _anees(tracks),
     }
-
-
-def _tracks(trial: dict[str, Any]) -> list[dict[str, Any]]:
-    """Target beliefs of a trial; the bound has one per target, the fleet one per target and robot."""
-    tracks = []
-    for item in trial["targets"].values():
-        tracks += [item] if "count" in item else list(item.values())
-    return tracks
 
 
 def trial_figures(reduced: dict[str, Any]) -> dict[str, Any]:
@@ -188,7 +216,7 @@ def trial_figures(reduced: dict[str, Any]) -> dict[str, Any]:
     row = fleet_figures([reduced])
     for name, item in reduced["robots"].items():
         row[f"{name}_position_rmse_m"] = _rmse([item])
-        row[f"{name}_nees"] = _mean([item], "nees")
+        row[f"{name}_nees"] = _anees([item])
     return row
 
 
@@ -198,8 +226,12 @@ def combine(trials: Sequence[dict[str, Any]], lost_above_m: float) -> dict[str, 
     `robots`, `targets`, `fleet` and `bound` are over converged trials, `all` over all of them, `median` is the
     median over all trials of each trial's figure. If every trial is lost the figures are over all trials. The
     bound is a filter too: its own lost trials are left out of its figures and counted in `bound.lost`.
+    `covariance_unusable` counts estimates in the window whose covariance is not positive definite, over all trials:
+    they have no NEES. Raises `ValueError` without trials.
     """
-    converged = [trial for trial in trials if not is_lost(_beliefs(trial), lost_above_m)]
+    if not trials:
+        raise ValueError("no trials to combine; give at least one")
+    converged = [trial for trial in trials if not is_lost(trial, lost_above_m)]
     used = converged or list(trials)
     first = trials[0]
     summary: dict[str, Any] = {
@@ -211,19 +243,21 @@ def combine(trials: Sequence[dict[str, Any]], lost_above_m: float) -> dict[str, 
         },
         "fleet": fleet_figures(used),
         "all": fleet_figures(trials),
+        "covariance_unusable": sum(
+            item["count"] - item["nees_count"]
+            for trial in trials
+            for item in [*trial["robots"].values(), *_tracks(trial)]
+        ),
     }
     single = [fleet_figures([trial]) for trial in trials]
     summary["median"] = {key: _median([figures[key] for figures in single]) for key in single[0]}
     if first["bound"] is not None:
         bounds = [trial["bound"] for trial in used]
-        kept = [
-            bound
-            for bound in bounds
-            if not is_lost([*bound["robots"].values(), *bound["targets"].values()], lost_above_m)
-        ] or bounds
+        held = [bound for bound in bounds if not is_lost(bound, lost_above_m)]
+        kept = held or bounds
         summary["bound"] = {
             **fleet_figures(kept),
-            "lost": len(bounds) - len(kept),
+            "lost": len(bounds) - len(held),
             "robots": {name: _entity([bound["robots"][name] for bound in kept], True) for name in first["robots"]},
             "targets": {name: _entity([bound["targets"][name] for bound in kept], False) for name in first["targets"]},
         }
