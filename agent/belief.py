@@ -64,7 +64,8 @@ class CorrelationStack:
 class PairRecord:
     """Book-keeping of one pair: the last contact applied, and contacts opened since whose fate is unknown.
 
-    `known` is False when the correlation has been lost; such a pair is updated by intersection alone.
+    `known` is False when the correlation has been lost and zero may not be assumed yet; the pair's measurements
+    are not used until it has begun anew.
     """
 
     base: Epoch = NEVER

@@ -67,7 +67,7 @@ class Agent:
         except np.linalg.LinAlgError:
             self.counters["update.failed"] += 1
         self._drain(effects)
-        self._pairs.expire(self.now_ns)
+        self._pairs.expire(self.now_ns, effects)
         if self.state is not self._published:
             self._published = self.state
             effects.append(Publish(self.estimate()))

@@ -5,7 +5,8 @@ Rules
 1. The robot that owns a measurement of a peer at instant k initiates. It opens an identity line for the
    contact's epoch (k, initiator, counter), and sends its snapshot at k with the measurement.
 2. The responder takes its own snapshot at k from its history, answers with it, and updates itself.
-3. The initiator updates itself when the answer comes. If it never comes the transaction is forgotten; the line
+3. The initiator updates itself when the answer comes. Until then it repeats the same request after each time-out,
+   as long as the responder can still have the instant in its history; then the transaction is forgotten. The line
    stays, because the responder may have updated itself.
 4. Either update concerns the own belief only. The cross-covariance after a contact is the same whether one or
    both applied it, so a lost, late, repeated or reordered message can never make the factors inconsistent.
@@ -14,6 +15,9 @@ Rules
 6. A contact at or before the last applied one is superseded; a repeated request of the last one is answered
    with the same reply and not applied again; an instant that has left the history is answered TOO_OLD.
 7. An answer other than OK proves that the responder did not apply the contact: its line is dropped.
+8. If the correlation can't be recovered from the two snapshots (a line was forgotten, a side has lost its factors)
+   both sides see that alike. Neither uses the measurement; each doubles its own covariance, once in a while at most,
+   and the pair begins anew uncorrelated: blk(2 P_a, 2 P_b) bounds the joint covariance whatever the correlation.
 
 Theory: with the innovation nu = H_i e_i + H_j e_j + v and the optimal gain, e_i+ is uncorrelated with nu, hence
 E[e_i+ e_j^T] = E[e_i e_j+^T] = E[e_i+ e_j+^T]. A line Psi maps a robot's error at k to its error now, so
@@ -48,10 +52,11 @@ class Step(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pending:
-    """An own request on its way: what was sent, and when to stop waiting for the answer."""
+    """An own request on its way: what was sent, when to repeat it, and when to give up."""
 
     request: PairRequest
     deadline_ns: int
+    give_up_ns: int
 
     @property
     def epoch(self) -> Epoch:
@@ -82,9 +87,9 @@ REPLY_TABLE: dict[tuple[bool, bool, bool], Step] = {
 class PairExchange:
     """State of the protocol with one peer: the pending request and the last reply given."""
 
-    def __init__(self, robot: str, peer: str, interval_ns: int, timeout_ns: int) -> None:
+    def __init__(self, robot: str, peer: str, interval_ns: int, timeout_ns: int, horizon_ns: int) -> None:
         self._robot, self._peer = robot, peer
-        self._interval_ns, self._timeout_ns = interval_ns, timeout_ns
+        self._interval_ns, self._timeout_ns, self._horizon_ns = interval_ns, timeout_ns, horizon_ns
         self._counter = 0
         self._last_reply: PairReply | None = None
         self.pending: Pending | None = None
@@ -110,14 +115,14 @@ class PairExchange:
         """Open a contact; the caller keeps an identity line for the request's epoch and sends the request."""
         self._counter += 1
         request = PairRequest(Epoch(t_ns, self._robot, self._counter), measurements, snapshot)
-        self.pending = Pending(request, now_ns + self._timeout_ns)
+        self.pending = Pending(request, now_ns + self._timeout_ns, t_ns + self._horizon_ns)
         return request
 
     def requested(self, epoch: Epoch, base: Epoch) -> Step:
         """The peer opened a contact."""
+        if self._last_reply is not None and self._last_reply.epoch == epoch:
+            return Step.REPEAT_REPLY
         if base.met and epoch <= base:
-            if self._last_reply is not None and self._last_reply.epoch == epoch:
-                return Step.REPEAT_REPLY
             return Step.ANSWER_SUPERSEDED
         step = REQUEST_TABLE[self.pending is not None, self.is_low]
         if step is Step.APPLY_ABANDON_OWN:
@@ -143,12 +148,17 @@ class PairExchange:
             self.pending = None
         return step, pending if matches else None
 
-    def expired(self, now_ns: int) -> bool:
-        """Whether the pending request has just timed out; it is forgotten, its line is not."""
-        if self.pending is None or now_ns < self.pending.deadline_ns:
-            return False
-        self.pending = None
-        return True
+    def expired(self, now_ns: int) -> PairRequest | None:
+        """The pending request if it is due to be repeated now; it is forgotten when it is too old for that."""
+        pending = self.pending
+        if pending is None or now_ns < pending.deadline_ns:
+            return None
+        if now_ns >= pending.give_up_ns:
+            self.pending = None
+            return None
+        deadline = min(now_ns + self._timeout_ns, pending.give_up_ns)
+        self.pending = Pending(pending.request, deadline, pending.give_up_ns)
+        return pending.request
 
     def restarted(self) -> None:
         """The peer began a new life: nothing of the old one will be answered."""

@@ -12,11 +12,8 @@ from numpy.typing import NDArray
 from agent.belief import Part, RobotState, TargetState
 from agent.effects import Effect, Send
 from agent.estimation.colocalization import (
-    Contact,
     Options,
-    Update,
     contact,
-    pair_intersection,
     pair_update,
 )
 from agent.estimation.gaussian import symmetrize, wrap_components
@@ -69,7 +66,11 @@ class Pairs:
         if peer not in self._exchanges:
             localization = self._settings.localization
             self._exchanges[peer] = PairExchange(
-                self._settings.robot, peer, localization.pair_interval_ns, localization.pair_timeout_ns
+                self._settings.robot,
+                peer,
+                localization.pair_interval_ns,
+                localization.pair_timeout_ns,
+                self._settings.lateness.horizon_ns,
             )
         return self._exchanges[peer]
 
@@ -77,9 +78,15 @@ class Pairs:
         """When the first pending request times out."""
         return min((e.pending.deadline_ns for e in self._exchanges.values() if e.pending), default=FAR_FUTURE_NS)
 
-    def expire(self, now_ns: int) -> None:
-        for exchange in self._exchanges.values():
-            if exchange.expired(now_ns):
+    def expire(self, now_ns: int, effects: list[Effect]) -> None:
+        """Repeat requests that have waited long enough, and forget those that are too old."""
+        for peer, exchange in self._exchanges.items():
+            waiting = exchange.pending is not None
+            request = exchange.expired(now_ns)
+            if request is not None:
+                self._counters["pair.repeated"] += 1
+                effects.append(Send(peer, request.epoch.t_meas_ns, request))
+            elif waiting and exchange.pending is None:
                 self._counters["pair.timed_out"] += 1
 
     def snapshot(self, state: RobotState, peer: str) -> Snapshot:
@@ -211,15 +218,22 @@ class Pairs:
         self.exchange(event.peer).restarted()
         if not state.pair(event.peer).base.met and not state.pair(event.peer).lines:
             return state
-        self._counters["pair.restarts"] += 1
-        last = self._inflated_ns.get(event.peer)
-        if last is not None and event.t_ns - last < self._settings.localization.restart_interval_ns:
-            state = state.forgotten(event.peer, known=False)
-        else:
-            self._inflated_ns[event.peer] = event.t_ns
-            state = replace(state.forgotten(event.peer, known=True), cov=2.0 * state.cov)
+        state = self._restarted_pair(event.peer, event.t_ns, state)
         history.updated(state)
         return state
+
+    def _restarted_pair(self, peer: str, now_ns: int, state: RobotState) -> RobotState:
+        """Begin the pair anew: own covariance doubled, correlation zero.
+
+        No peer may inflate us again within `restart_interval_ns`; its correlation counts as unknown until then.
+        """
+        last = self._inflated_ns.get(peer)
+        if last is not None and now_ns - last < self._settings.localization.restart_interval_ns:
+            self._counters["pair.restart_refused"] += 1
+            return state.forgotten(peer, known=False)
+        self._inflated_ns[peer] = now_ns
+        self._counters["pair.restarts"] += 1
+        return replace(state.forgotten(peer, known=True), cov=2.0 * state.cov)
 
     # -- estimation -----------------------------------------------------------------------------------------
 
@@ -267,7 +281,7 @@ class Pairs:
     ) -> RobotState:
         localization = self._settings.localization
         correlated = localization.correlation == "factors"
-        own, other = (initiator, responder) if own_initiated else (responder, initiator)
+        other = responder if own_initiated else initiator
         own_is_low = self._settings.robot < peer
         try:
             found = contact(
@@ -280,46 +294,25 @@ class Pairs:
         if psi is None:
             self._counters["pair.line_lost"] += 1
             return state
-        update = self._own_update(found, own, other, own_initiated, psi, state)
+        if found.cross is None:
+            self._counters["pair.fallback"] += 1
+            state = self._restarted_pair(peer, state.t_ns, state)
+            history.updated(state)
+            return state
+        C_own = found.C_i if own_initiated else found.C_j
+        update = pair_update(state.mean, state.cov, self._settings.layout, psi, C_own, found)
         if update is None:
+            self._counters["update.not_positive_definite"] += 1
             return state
         state = state.updated(update.mean, update.cov, update.left)
-        if found.cross is None:
-            state = state.forgotten(peer, known=False)
-        elif correlated:
-            after = found.cross_after if own_initiated else found.cross_after.T
-            state = state.with_base(peer, epoch, psi @ after, psi)
-        else:
-            state = state.with_base(peer, epoch, np.zeros((len(psi), len(other.belief.mean))), psi)
+        after = found.cross_after if own_initiated else found.cross_after.T
+        factor = psi @ after if correlated else np.zeros_like(after)
+        state = state.with_base(peer, epoch, factor, psi)
         state = self._fuse_targets(other, t_ns, state, correlated)
         history.updated(state, update.left)
         self._count_nis("pair_" + "+".join(item.kind for item in measurements), update.nis)
         self._counters["pair.applied_initiator" if own_initiated else "pair.applied_responder"] += 1
         return state
-
-    def _own_update(
-        self,
-        found: Contact,
-        own: Snapshot,
-        other: Snapshot,
-        own_initiated: bool,
-        psi: Array,
-        state: RobotState,
-    ) -> Update | None:
-        layout = self._settings.layout
-        if found.cross is not None:
-            C_own = found.C_i if own_initiated else found.C_j
-            update = pair_update(state.mean, state.cov, layout, psi, C_own, found)
-            if update is None:
-                self._counters["update.not_positive_definite"] += 1
-            return update
-        self._counters["pair.fallback"] += 1
-        H_own, H_other = (found.H_i, found.H_j) if own_initiated else (found.H_j, found.H_i)
-        other_term = H_other @ other.belief.cov @ H_other.T
-        weight = self._settings.localization.sighting_weight
-        return pair_intersection(
-            state.mean, state.cov, layout, psi, H_own, own.belief.cov, other_term, found, weight
-        )
 
     def _fuse_targets(self, other: Snapshot, t_ns: int, state: RobotState, correlated: bool) -> RobotState:
         """Intersect the peer's target beliefs, predicted to the state's instant, with the own ones."""

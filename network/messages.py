@@ -21,7 +21,7 @@ MAX_MESSAGE_BYTES = 1200
 """One message fits one datagram on a radio with a 1,280-byte MTU."""
 
 MAX_LINES = 4
-"""Unresolved identity lines a snapshot carries at most; an older contact falls back to intersection."""
+"""Unresolved identity lines a snapshot carries at most; a pair that would need an older one begins anew."""
 
 MAX_STATE_DIM = 8
 MAX_TARGETS = 8
@@ -122,7 +122,7 @@ class Snapshot:
     factor (n, m) sigma for the pair, P_ab = sigma_a sigma_b^T; (n, 0) when never met
     line   (n, n) left factors accumulated since `base`
     lines  later contacts the sender opened and does not know the fate of, oldest first
-    known  False when the correlation of the pair has been lost and only intersection is safe
+    known  False when the correlation of the pair has been lost and zero may not be assumed
     """
 
     belief: Belief

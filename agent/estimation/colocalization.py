@@ -155,7 +155,7 @@ def resolve_cross(low: Snapshot, high: Snapshot) -> Array | None:
     """P_ab (n_a, n_b) at a contact from both snapshots, `low` being the robot with the lower id.
 
     Equal bases: sigma_a Psi_b^T. If one side applied a later contact than the other, the other's line for that
-    contact takes the place of its Psi. None: the correlation can't be recovered, only intersection is safe.
+    contact takes the place of its Psi. None: the correlation can't be recovered.
     """
     if not low.known or not high.known:
         return None
@@ -202,9 +202,6 @@ class Contact:
     innovation: Array
     cross: Array | None
     nis: float
-    H_i: Array
-    H_j: Array
-    noise: Array
 
     @property
     def cross_after(self) -> Array:
@@ -254,11 +251,8 @@ def contact(
     mean = np.concatenate([initiator.belief.mean, responder.belief.mean])
     predicted = observe(model.h, model.jacobian, mean, joint, model.angles, options.transform, options.parameters)
     innovation = _innovation(predicted, z, model.angles)
-    plain = predicted.cov + R
-    S, nis = _capped(innovation, plain, options.innovation_cap)
-    H_i, H_j = predicted.H[:, :n], predicted.H[:, n:]
-    noise = symmetrize(predicted.residual + R + (S - plain))
-    return Contact(predicted.cross[:n], predicted.cross[n:], S, innovation, cross, nis, H_i, H_j, noise)
+    S, nis = _capped(innovation, predicted.cov + R, options.innovation_cap)
+    return Contact(predicted.cross[:n], predicted.cross[n:], S, innovation, cross, nis)
 
 
 def pair_update(
@@ -271,29 +265,3 @@ def pair_update(
     """
     return _applied(mean, cov, layout, gain(psi @ C_own, found.S), found.S, found.innovation, found.nis)
 
-
-def pair_intersection(
-    mean: Array,
-    cov: Array,
-    layout: StateLayout,
-    psi: Array,
-    H_own: Array,
-    own_cov: Array,
-    other_term: Array,
-    found: Contact,
-    weight: Weight,
-) -> Update | None:
-    """One side's update when the pair's correlation is unknown; None when it does not help.
-
-    own_cov (n, n) is the covariance at the contact, other_term (m, m) the peer's share of the innovation.
-    """
-    cross = own_cov @ H_own.T
-    best = best_inflated_update(
-        own_cov, H_own, H_own @ cross, other_term, found.noise, weight, now=cov, cross_now=psi @ cross
-    )
-    if best is None:
-        return None
-    K, posterior, left, _ = best
-    if not is_positive_definite(posterior):
-        return None
-    return Update(wrap_components(mean + K @ found.innovation, layout.angles), posterior, left, found.nis)

@@ -54,29 +54,24 @@ def best_inflated_update(
     other_term: Array,
     noise: Array,
     weight: Weight,
-    now: Array | None = None,
-    cross_now: Array | None = None,
 ) -> tuple[Array, Array, Array, float] | None:
     """Update own belief with a measurement that involves another belief of unknown correlation.
 
     For w on a grid the prior is cov / w and the other's share of the innovation `other_term` / (1 - w):
     S(w) = H P H^T / w + other_term / (1 - w) + noise (UT-CLAT eq. 16 with one weight per belief).
     cov (n, n), H_own (m, n), own_term = H P H^T (m, m), other_term (m, m), noise (m, m) including residuals.
-    For a delayed measurement `now` is the present covariance and `cross_now` its cross-covariance with the
-    error at the instant of the measurement times H^T (n, m). Returns (gain (n, m), cov_new, left (n, n), w),
-    or None when no weight beats leaving the belief alone.
+    Returns (gain (n, m), cov_new, left (n, n), w), or None when no weight beats leaving the belief alone.
     """
-    present = cov if now is None else now
-    cross = cov @ H_own.T if cross_now is None else cross_now
+    cross = cov @ H_own.T
     w = GRID[:, None, None]
     S = own_term / w + other_term / (1.0 - w) + noise
     gains = gain(np.broadcast_to(cross, (len(GRID), *cross.shape)), S) / w
-    covs = present / w - gains @ S @ gains.swapaxes(-1, -2)
+    covs = cov / w - gains @ S @ gains.swapaxes(-1, -2)
     costs = cost(covs, weight)
     index = int(np.argmin(costs))
-    if not costs[index] < cost(present, weight):
+    if not costs[index] < cost(cov, weight):
         return None
     best = float(GRID[index])
     updated = symmetrize(covs[index])
-    left = gain(updated, present / best)
+    left = gain(updated, cov / best)
     return gains[index], updated, left, best
