@@ -120,7 +120,7 @@ def _records(path: Path, unfinished: bool) -> Iterator[Any]:
     """Raw records of a file in order. Raises `RecordingError`; an unfinished file may be read up to its end."""
     try:
         with path.open("rb") as file:
-            yield from StreamReader(file).records
+            yield from StreamReader(file, validate_crcs=True).records
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file") from None
     except Exception:
@@ -133,8 +133,14 @@ def read_agents(path: Path, unfinished: bool = False) -> dict[str, tuple[AgentCo
     agents = {}
     for record in _records(path, unfinished):
         if isinstance(record, Metadata) and record.name.startswith("agent/"):
-            config = AgentConfig.model_validate(json.loads(record.metadata["config"]))
-            agents[record.name.removeprefix("agent/")] = (config, int(record.metadata["start_ns"]))
+            robot = record.name.removeprefix("agent/")
+            try:
+                config = AgentConfig.model_validate(json.loads(record.metadata["config"]))
+                agents[robot] = (config, int(record.metadata["start_ns"]))
+            except (KeyError, ValueError):
+                raise RecordingError(
+                    f"{path}: the configuration of '{robot}' is of another version; replay it with the one it is from"
+                ) from None
     if not agents and not unfinished:
         raise RecordingError(f"{path}: holds no agent; it was not written by cofix")
     return agents
@@ -156,19 +162,32 @@ def read_boundary(path: Path, robot: str, unfinished: bool = False) -> Iterator[
             if topic == f"{robot}/events":
                 if event is not None:
                     yield event, followed
-                event, followed = unpack(record.data), []
+                event, followed = _event(path, record.data), []
             elif topic == f"{robot}/effects":
                 followed.append(record.data)
     if event is not None:
         yield event, followed
 
 
+def _event(path: Path, data: bytes) -> Event:
+    try:
+        event = unpack(data)
+    except Exception:
+        event = None
+    if not isinstance(event, Event):
+        raise RecordingError(f"{path}: holds an event of another version; replay it with the one it is from")
+    return event
+
+
 def replay(path: Path, robot: str) -> tuple[int, int, int | None]:
     """Play a robot's events into a fresh core.
 
-    Returns (events, effects, index of the first event whose effects differ or None).
+    Returns (events, effects, index of the first event whose effects differ or None). Raises `RecordingError`.
     """
-    config, start_ns = read_agents(path)[robot]
+    agents = read_agents(path)
+    if robot not in agents:
+        raise RecordingError(f"{path}: no robot '{robot}'; it holds {', '.join(sorted(agents))}")
+    config, start_ns = agents[robot]
     agent = Agent(config.settings(start_ns))
     events = effects = 0
     for event, recorded in read_boundary(path, robot):
