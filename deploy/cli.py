@@ -18,8 +18,17 @@ import json  # noqa: E402
 import logging  # noqa: E402
 import sys  # noqa: E402
 from pathlib import Path  # noqa: E402
+from typing import NoReturn  # noqa: E402
 
-DEMO = "demo"
+MAX_SEED = 2**63 - 1
+
+
+class Parser(argparse.ArgumentParser):
+    """Answers wrong use with one line instead of the whole usage."""
+
+    def error(self, message: str) -> NoReturn:
+        line = " ".join(message.split())
+        self.exit(2, f"{self.prog}: {line}; see {self.prog} --help\n")
 
 
 def _number(text: str, what: str, low: float) -> float:
@@ -28,7 +37,7 @@ def _number(text: str, what: str, low: float) -> float:
     except ValueError:
         raise argparse.ArgumentTypeError(f"{what} must be a number, not '{text}'") from None
     if not low < value < 1e9:
-        raise argparse.ArgumentTypeError(f"{what} must be above {low:g}, not {text}")
+        raise argparse.ArgumentTypeError(f"{what} must lie between {low:g} and 1e9, not {text}")
     return value
 
 
@@ -47,13 +56,19 @@ def _count(text: str) -> int:
     return int(value)
 
 
-def parser() -> argparse.ArgumentParser:
+def _seed(text: str) -> int:
+    if not text.isdecimal() or int(text) > MAX_SEED:
+        raise argparse.ArgumentTypeError(f"a whole number from 0 to {MAX_SEED} is needed, not '{text}'")
+    return int(text)
+
+
+def parser() -> Parser:
     """The whole command line."""
-    root = argparse.ArgumentParser(prog="cofix", description="Robots that cannot trust GPS locate each other.")
+    root = Parser(prog="cofix", description="Robots that cannot trust GPS locate each other.")
     commands = root.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def scenario_options(command: argparse.ArgumentParser) -> None:
-        command.add_argument("--seed", type=int, default=1, help="every random number follows from it (default 1)")
+        command.add_argument("--seed", type=_seed, default=1, help="every random number follows from it (default 1)")
         command.add_argument(
             "--set", action="append", default=[], metavar="KEY=VALUE", help="override a key, e.g. links.loss=0.3"
         )

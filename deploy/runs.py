@@ -17,6 +17,7 @@ import tomli_w
 from agent.config import AgentConfig, ConfigError
 from agent.node import Recorder
 from agent.recording import RecordingWriter
+from agent.settings import NS
 from agent.shell import FATE_COLUMNS, fate_row
 from deploy.evaluate import collect, merge_fates, merge_recordings
 from deploy.launch import Launcher, LaunchError
@@ -77,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
         runtime,
         options.seed,
         [reduce(scenario, result)],
-        simulated_s=world.steps * world.step_ns * 1e-9,
+        simulated_s=world.steps * world.step_ns / NS,
         timing=timing,
         exits=exits,
     )
@@ -105,7 +106,7 @@ def montecarlo(options: argparse.Namespace) -> int:
         "virtual",
         options.seed,
         reduced,
-        simulated_s=world.steps * world.step_ns * 1e-9,
+        simulated_s=world.steps * world.step_ns / NS,
         timing={"wall_s": time.perf_counter() - started},
     )
     per_trial = [trial_figures(item["figures"]) for item in reduced]

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from agent.estimation.motion import LAYOUTS
 from agent.node import Node, Outgoing, Recorder, rejected
 from agent.sensor_input import encode
+from agent.settings import NS
 from network.links import FateRecord, LinkModel, RangeTable
 from network.messages import Packet
 from network.wire import peek_header
@@ -69,7 +70,7 @@ class TrialResult:
 
 def sample_stride(step_ns: int) -> int:
     """Steps between two samples of the figures: every step, but at most once per second."""
-    return max(1, round(1_000_000_000 / step_ns))
+    return max(1, round(NS / step_ns))
 
 
 class Sampler:
@@ -118,7 +119,7 @@ class Sampler:
                 "targets": {name: state(name, self._bound[name]) for name in self._world.targets},
             }
         return TrialTrace(
-            t_s=np.array(self._instants) * self._world.step_ns * 1e-9,
+            t_s=np.array(self._instants) * self._world.step_ns / NS,
             robots={name: state(name, self._owned[name, name]) for name in self._world.robots},
             targets={
                 target: {name: state(target, self._owned[name, target]) for name in self._world.robots}
@@ -215,7 +216,7 @@ class VirtualEngine:
         before = counters["pair.applied_initiator"] + counters["pair.applied_responder"]
         out = node.on_packet(self._now, packet)
         if counters["pair.applied_initiator"] + counters["pair.applied_responder"] > before:
-            self.contacts.append((self._now * 1e-9, robot, packet.source))
+            self.contacts.append((self._now / NS, robot, packet.source))
         self._carry_out(robot, out)
 
     def _carry_out(self, robot: str, out: Outgoing) -> None:
