@@ -27,7 +27,7 @@ from agent.control import ControlLine
 from agent.effects import Estimate
 from agent.events import Event
 from agent.fleet_clock import FleetClock
-from agent.mavlink import MavlinkLink
+from agent.mavlink import MavlinkError, MavlinkLink
 from agent.node import Node, Outgoing, rejected
 from agent.recording import RecordingWriter
 from agent.state_file import next_incarnation
@@ -100,15 +100,15 @@ class AgentShell:
 
     async def _open(self) -> None:
         config = self.config
-        try:
-            self._state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
-            counted = config.identity.incarnation
-            self._incarnation = counted if counted is not None else next_incarnation(self._state_dir, time.time_ns())
-        except OSError as error:
-            raise ConfigError(f"state_dir {self._state_dir} cannot be written: {error.strerror}") from None
         if config.control_socket is not None:
             self._control = ControlLine(self.robot)
             await self._control.connect(config.control_socket)
+        try:
+            self._state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+            counted = config.identity.incarnation
+            self._incarnation = counted or next_incarnation(self._state_dir, time.time_ns())
+        except OSError as error:
+            raise ConfigError(f"state_dir {self._state_dir} cannot be written: {error.strerror}") from None
         self._boot_id = secrets.randbits(53)
         settings = ZenohSettings(
             fleet=config.identity.fleet,
@@ -199,7 +199,19 @@ class AgentShell:
             self._reader = AutopilotReader(config.mavlink.settings(list(config.origin)))
             self._mavlink = MavlinkLink(config.mavlink.endpoint, self._reader, self._clock, self.on_event)
             await self._mavlink.start()
+            await self._reached(config.mavlink.endpoint)
         self._arm()
+
+    async def _reached(self, endpoint: str) -> None:
+        """A stream must be there at the start, for a wrong address must not go unnoticed; later it is redialled."""
+        assert self._mavlink is not None
+        if endpoint.startswith("udp"):
+            return
+        for _ in range(50):
+            if self._mavlink.connected:
+                return
+            await asyncio.sleep(0.1)
+        raise MavlinkError(f"mavlink.endpoint {endpoint}: nothing answers; start the autopilot or correct the endpoint")
 
     def _record(self, event: Event, effects: list[Any]) -> None:
         assert self._recording is not None
