@@ -15,7 +15,8 @@ from agent.config import ConfigError
 from agent.estimation.motion import compose
 from agent.fleet_clock import FleetClock
 from agent.mavlink import MavlinkError
-from sim.autopilot import StandIn, StandInServer, StandInSettings
+from sim.autopilot import StandIn, StandInServer
+from sim.vehicle_telemetry import StandInSettings
 
 RATE_HZ = 20.0
 ORIGIN = (47.397742, 8.545594, 488.0)

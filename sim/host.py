@@ -23,10 +23,11 @@ from agent.control import ControlLine
 from agent.fleet_clock import FleetClock
 from agent.sensor_input import encode
 from network.link_feed import LinkFeed
-from sim.autopilot import StandIn, StandInServer, StandInSettings
+from sim.autopilot import StandIn, StandInServer
 from sim.reach import Reach
 from sim.scenario import RobotPart, load
 from sim.trial import open_world
+from sim.vehicle_telemetry import StandInSettings
 from sim.world import Output, World
 
 BOOT_LEAD_NS = 30_000_000_000
