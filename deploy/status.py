@@ -122,7 +122,7 @@ def print_summary(summary: dict[str, Any], run_dir: Path, report: Path | None) -
     if trials > 1:
         head += f", {trials} trials, {summary['lost']} lost"
     table = Table(title=head, title_justify="left")
-    columns = ("robot", "position RMSE [m]", "max [m]", "heading RMSE [rad]", "ANEES (ideal 1)", "in 3 sigma")
+    columns = ("robot", "RMSE [m]", "max [m]", "heading RMSE [rad]", "ANEES", "inside 3σ")
     for name in columns:
         table.add_column(name, justify="left" if name == "robot" else "right")
     for robot, entry in summary["robots"].items():
@@ -147,7 +147,7 @@ def print_summary(summary: dict[str, Any], run_dir: Path, report: Path | None) -
     bound = summary.get("bound")
     if bound:
         table.add_row(
-            "centralized bound",
+            "centralized",
             _number(bound["position_rmse_m"], 3),
             "",
             _number(bound.get("heading_rmse_rad"), 3),

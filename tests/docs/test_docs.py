@@ -1,0 +1,86 @@
+"""What the documents tell people to type works."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from deploy.cli import parser
+from sim.scenario import bundled, load
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCUMENTS = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "docs" / "interfaces.md")
+PLACEHOLDERS = {"NAME-TIME": "demo-1", "CONFIG": "r1.toml", "FOLDER_OF_MRCLAM_Dataset7": "folder"}
+
+
+def commands(document: Path) -> list[str]:
+    """Lines of indented blocks that start with `cofix`, without comments."""
+    found = []
+    for line in document.read_text().splitlines():
+        match = re.match(r"    (cofix .*)", line)
+        if match:
+            found.append(match.group(1).split("  #")[0].strip())
+    return found
+
+
+ALL = [(document.name, line) for document in DOCUMENTS for line in commands(document)]
+
+
+@pytest.mark.parametrize(("document", "line"), ALL)
+def test_commands_are_understood(document: str, line: str) -> None:
+    for name, value in PLACEHOLDERS.items():
+        line = line.replace(name, value)
+    options = parser().parse_args(shlex.split(line)[1:])
+    if getattr(options, "scenario", None) is not None:
+        load(options.scenario, options.set)
+
+
+def test_the_readme_shows_commands() -> None:
+    assert len(commands(ROOT / "README.md")) >= 8
+
+
+def test_the_readme_names_every_scenario_and_no_other() -> None:
+    rows = re.findall(r"^\| `([a-z0-9-]+)` \|", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert sorted(row for row in rows if row in bundled()) == bundled()
+
+
+def test_a_readme_run_works_as_written_but_shorter(tmp_path: Path) -> None:
+    line = next(item for item in commands(ROOT / "README.md") if "links.loss" in item)
+    arguments = [*shlex.split(line)[1:], "--duration", "20", "--set", "window_s=[5, 20]"]
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "deploy.cli", *arguments],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    (run,) = (tmp_path / "runs").iterdir()
+    told = re.findall(r"^\| `([\w./<>{}-]+)`", (ROOT / "docs" / "interfaces.md").read_text(), re.MULTILINE)
+    for name in ("scenario.toml", "summary.json", "report.html", "recording.mcap", "trace.npz", "fates.csv"):
+        assert name in told
+        assert (run / name).exists()
+
+
+def test_the_driver_example_runs() -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "interfaces.md").read_text(), re.DOTALL)
+    names: dict[str, object] = {}
+    exec(compile(code, "interfaces.md", "exec"), names)
+    from agent.sensor_input import decode
+
+    datagram = names["datagram"]
+    assert isinstance(datagram, bytes)
+    event = decode(datagram, 0, {})
+    assert getattr(event, "of", None) == "r2"
+
+
+def test_the_map_names_files_that_exist() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    for floor, files in re.findall(r"^\| `(network|agent|sim|deploy)/([\w.]+)`", text, re.MULTILINE):
+        assert (ROOT / floor / files).exists(), f"{floor}/{files}"
