@@ -165,9 +165,8 @@ def _page(run_dir: Path, summary: dict[str, Any], pictures: dict[str, tuple[str,
     )
     command = run_dir / "command.txt"
     if command.exists():
-        blocks.append(
-            f"<section><h2>Run it again</h2><pre>{html.escape(command.read_text(encoding='utf-8', errors='replace').strip())}</pre></section>"
-        )
+        line = html.escape(command.read_text(encoding="utf-8", errors="replace").strip())
+        blocks.append(f"<section><h2>Run it again</h2><pre>{line}</pre></section>")
     blocks.append(
         "<footer>RMSE: root mean square error. ANEES: mean of e′P⁻¹e per degree of freedom, 1 when errors are as large "
         "as claimed. Inside 3σ: share of components within three of their claimed standard deviations. Centralized "

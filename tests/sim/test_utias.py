@@ -204,8 +204,8 @@ def test_increments_compose_and_match_small_steps(
     edges = sorted({a, c, *(t for t, _, _ in lines if a < t < c)})
     for start, end in pairwise(edges):
         v, w = next(((v, w) for t, v, w in reversed(lines) if t <= start), (0.0, 0.0))
-        for _ in range(50):
-            dt = (end - start) * 1e-3 / 50
+        for _ in range(200):
+            dt = (end - start) * 1e-3 / 200
             x, y = x + v * dt * math.cos(heading + w * dt / 2), y + v * dt * math.sin(heading + w * dt / 2)
             heading += w * dt
     assert whole[:2] == pytest.approx([x, y], abs=2e-3)
