@@ -95,6 +95,21 @@ def test_the_bound_is_honest(trials: list[TrialResult]) -> None:
     assert low <= np.mean(values) <= high, f"seeds {SEEDS}"
 
 
+def test_a_peer_is_brought_to_the_instant_at_which_it_is_seen() -> None:
+    """r2 drives 3 m per step: a range held against where it was a step ago would be off by as much."""
+    part = {"start_sigma": {"position_m": 0.1, "heading_rad": 0.01}, "noise": {"speed_mps": 0.3}}
+    seer = {"id": "r1", "start": {"pose": [0.0, 0.0, 0.0]}, "sensors": {"range": {"of": ["peers"], "sigma_m": 0.05}}}
+    driver = {"id": "r2", "start": {"pose": [5.0, 0.0, 0.0]}, "control": {"speed_mps": 3.0}}
+    made = alone({}, robots=[part | seer, part | driver], duration_s=20.0)
+    for seed in range(5):
+        world = open_world(made, seed)
+        runner = BoundRunner(made, world)
+        for k in range(1, 21):
+            runner.step(k, world.outputs(k))
+        error = np.abs(runner.belief("r2")[0] - runner.belief("r1")[0] - world.truth("r2", 20) + world.truth("r1", 20))
+        assert error[0] < 0.3, f"seed {seed}"
+
+
 def test_a_target_drifts_on_between_sightings() -> None:
     target = {
         "id": "t1",

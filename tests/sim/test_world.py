@@ -62,7 +62,7 @@ def is_chi_square(values: Array, dof: int, samples: int) -> bool:
 
 def test_truth_minus_odometry_has_the_covariance_odometry_states() -> None:
     squares = []
-    for seed in range(5):
+    for seed in range(20):
         world = SimulatedWorld(scenario(), seed)
         for item in everything(world):
             if item.kind == "odometry" and item.robot == "r1":
@@ -72,8 +72,8 @@ def test_truth_minus_odometry_has_the_covariance_odometry_states() -> None:
                 assert error[1] == pytest.approx(0.0, abs=1e-9), "a unicycle does not slip"
                 assert item.t0_ns == item.t_ns - world.step_ns
                 squares.append(error[0] ** 2 / item.R[0, 0] + error[2] ** 2 / item.R[3, 3])
-    assert len(squares) == 500
-    assert is_chi_square(np.array(squares), 2, 500)
+    assert len(squares) == 2000
+    assert is_chi_square(np.array(squares), 2, 2000)
 
 
 @pytest.mark.parametrize("step_s", [0.25, 1.0, 4.0])
