@@ -23,7 +23,7 @@ from agent.history import History, moved
 from agent.pairs import Pairs
 from agent.settings import AgentSettings
 from agent.timeline import Item, OdometryTrack, Phase, Timeline
-from network.messages import Measurement, PairReply, PairRequest
+from network.messages import Measurement, PairReply, PairRequest, Snapshot
 
 Array = NDArray[np.float64]
 
@@ -95,6 +95,10 @@ class Agent:
             for name, target in state.targets.items()
         )
         return Estimate(state.t_ns, self.settings.layout.name, state.mean, state.cov, tracks)
+
+    def snapshot(self, peer: str) -> Snapshot:
+        """The present state as it would be told to a peer."""
+        return self._pairs.snapshot(self.state, peer)
 
     def status(self) -> dict[str, object]:
         """A plain summary for people: instant, position and its deviation, pairs, counters."""

@@ -10,8 +10,10 @@ Rules
    stays, because the responder may have updated itself.
 4. Either update concerns the own belief only. The cross-covariance after a contact is the same whether one or
    both applied it, so a lost, late, repeated or reordered message can never make the factors inconsistent.
-5. One contact of a pair is pending at a time. If both measure at once the lower id's contact wins: the lower
-   answers BUSY, the higher gives its own up (and keeps its line).
+5. One contact of a pair is pending at a time. If both measure at once the lower id's contact wins: the higher gives
+   its own up (and keeps its line) when the lower's request comes, and the lower answers BUSY to any request that was
+   composed without knowing of its own latest one, for as long as the higher may still receive that. Otherwise each
+   could use the other's snapshot from before its update, and the factors would miss what the two updates share.
 6. A contact at or before the last applied one is superseded; a repeated request of the last one is answered
    with the same reply and not applied again; an instant that has left the history is answered TOO_OLD.
 7. An answer other than OK proves that the responder did not apply the contact: its line is dropped.
@@ -63,12 +65,17 @@ class Pending:
         return self.request.epoch
 
 
-# (own request pending, own id lower than the peer's) -> what a fresh request of the peer leads to
-REQUEST_TABLE: dict[tuple[bool, bool], Step] = {
-    (False, False): Step.APPLY,
-    (False, True): Step.APPLY,
-    (True, False): Step.APPLY_ABANDON_OWN,
-    (True, True): Step.ANSWER_BUSY,
+# (own request pending, own id lower, composed without knowing of the own latest request while that may still arrive)
+# -> what a fresh request of the peer leads to
+REQUEST_TABLE: dict[tuple[bool, bool, bool], Step] = {
+    (False, False, False): Step.APPLY,
+    (False, False, True): Step.APPLY,
+    (False, True, False): Step.APPLY,
+    (False, True, True): Step.ANSWER_BUSY,
+    (True, False, False): Step.APPLY_ABANDON_OWN,
+    (True, False, True): Step.APPLY_ABANDON_OWN,
+    (True, True, False): Step.APPLY_ABANDON_OWN,
+    (True, True, True): Step.ANSWER_BUSY,
 }
 
 # (it answers the pending request, its status is OK, its epoch is later than the base) -> what a reply leads to
@@ -92,6 +99,7 @@ class PairExchange:
         self._interval_ns, self._timeout_ns, self._horizon_ns = interval_ns, timeout_ns, horizon_ns
         self._counter = 0
         self._last_reply: PairReply | None = None
+        self._last_opened: Pending | None = None
         self.pending: Pending | None = None
 
     @property
@@ -115,19 +123,31 @@ class PairExchange:
         """Open a contact; the caller keeps an identity line for the request's epoch and sends the request."""
         self._counter += 1
         request = PairRequest(Epoch(t_ns, self._robot, self._counter), measurements, snapshot)
-        self.pending = Pending(request, now_ns + self._timeout_ns, t_ns + self._horizon_ns)
+        self.pending = self._last_opened = Pending(request, now_ns + self._timeout_ns, t_ns + self._horizon_ns)
         return request
 
-    def requested(self, epoch: Epoch, base: Epoch) -> Step:
-        """The peer opened a contact."""
+    def requested(self, request: PairRequest, base: Epoch) -> Step:
+        """The peer opened a contact; `base` is the last one applied here."""
+        epoch = request.epoch
         if self._last_reply is not None and self._last_reply.epoch == epoch:
             return Step.REPEAT_REPLY
         if base.met and epoch <= base:
             return Step.ANSWER_SUPERSEDED
-        step = REQUEST_TABLE[self.pending is not None, self.is_low]
+        step = REQUEST_TABLE[self.pending is not None, self.is_low, self._crossed(request)]
         if step is Step.APPLY_ABANDON_OWN:
             self.pending = None
         return step
+
+    def _crossed(self, request: PairRequest) -> bool:
+        """Whether the peer may have composed the request before it received the own latest one.
+
+        It can't have received that later than `give_up_ns`, so what was measured after that has not crossed it.
+        """
+        own = self._last_opened
+        if own is None or request.epoch.t_meas_ns > own.give_up_ns:
+            return False
+        told = request.snapshot
+        return told.base < own.epoch and all(line.epoch != own.epoch for line in told.lines)
 
     def answered(self, reply: PairReply) -> PairReply:
         """Remember the reply given, for a repeated request."""
@@ -162,5 +182,5 @@ class PairExchange:
 
     def restarted(self) -> None:
         """The peer began a new life: nothing of the old one will be answered."""
-        self.pending = None
+        self.pending = self._last_opened = None
         self._last_reply = None

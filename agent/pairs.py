@@ -155,7 +155,7 @@ class Pairs:
             self._counters["pair.malformed"] += 1
             return state
         exchange = self.exchange(peer)
-        step = exchange.requested(epoch, state.pair(peer).base)
+        step = exchange.requested(request, state.pair(peer).base)
         self._counters[f"pair.request_{step.value}"] += 1
         if step is Step.REPEAT_REPLY and exchange.last_reply is not None:
             effects.append(Send(peer, epoch.t_meas_ns, exchange.last_reply))

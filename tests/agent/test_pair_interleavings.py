@@ -1,0 +1,179 @@
+"""Every interleaving of loss, duplication, reordering and restart, two agents, four messages.
+
+Headings are known, so everything is linear, and the books must be exact: the claimed covariances and the
+cross-covariance the next contact would recover equal those of the true errors, whichever side applied which contact
+and when. After a restart they must bound them.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from agent.estimation.observation import RelativeModel
+from agent.events import Tick
+from agent.settings import NS
+from network.messages import Epoch, PairReply, PairRequest
+from tests.agent.courier import FIRST, SECOND, TINY, Ledger, Letter, Pair, gains_of
+
+Array = NDArray[np.float64]
+
+STARTS = {
+    FIRST: (np.array([0.0, 0.0, 0.0]), np.diag([0.3, 0.2, TINY])),
+    SECOND: (np.array([6.0, 2.0, 0.5]), np.diag([0.4, 0.5, TINY])),
+}
+NOISE = np.diag([0.01, 0.02, 0.0, 0.0])
+R = np.diag([0.05, 0.02]) ** 2
+
+FATES = ("now", "late", "lost", "twice")
+MESSAGES = 4
+WHO = {"first": (FIRST,), "second": (SECOND,), "both": (FIRST, SECOND)}
+OTHER = {FIRST: SECOND, SECOND: FIRST}
+
+
+class Story:
+    """Two contacts of a pair, with a fate for each of the first four messages; then a clean third contact."""
+
+    def __init__(self, fates: tuple[str, ...]) -> None:
+        self.pair = Pair(STARTS, timeout_s=1000.0, horizon_s=1000.0)
+        self.ledger = Ledger(STARTS)
+        self.requests: dict[Epoch, PairRequest] = {}
+        self.replies: dict[Epoch, PairReply] = {}
+        self.applied: list[tuple[Epoch, str]] = []
+        self._fates = list(fates)
+        self._late: list[Letter] = []
+        self.k = 0
+        self.pair.tell_life(FIRST, SECOND)
+        self.pair.tell_life(SECOND, FIRST)
+
+    def step(self) -> None:
+        """Both robots drive one second."""
+        self.k += 1
+        for name, agent in self.pair.agents.items():
+            delta = np.array([0.3, 0.1, 0.0, 0.0])
+            self.ledger.moved(name, float(agent.state.mean[2]), delta, NOISE)
+            self.pair.odometry(name, (self.k - 1) * NS, self.k * NS, delta, NOISE)
+
+    def contact(self, who: tuple[str, ...]) -> None:
+        """Those named measure the other; their letters and what follows meet their fates."""
+        self.ledger.mark(self.k * NS)
+        letters = []
+        for name in who:
+            own, other = self.pair.agents[name].state.mean, self.pair.agents[OTHER[name]].state.mean
+            z = RelativeModel("range_bearing", 3).h(np.concatenate([own, other])) + np.array([0.05, -0.02])
+            letters += self.pair.measure(name, self.k * NS, "range_bearing", z, R)
+        self._travel(letters)
+
+    def late(self) -> None:
+        """What was held back arrives, the newest first."""
+        held, self._late = self._late[::-1], []
+        for letter in held:
+            self._travel(self._handed(letter))
+
+    def _travel(self, letters: list[Letter]) -> None:
+        while letters:
+            following: list[Letter] = []
+            for letter in letters:
+                fate = self._fates.pop(0) if self._fates else "now"
+                if fate == "late":
+                    self._late.append(letter)
+                elif fate != "lost":
+                    for _ in range(2 if fate == "twice" else 1):
+                        following += self._handed(letter)
+            letters = following
+
+    def _handed(self, letter: Letter) -> list[Letter]:
+        """Deliver a letter and enter what the receiver did with it into the ledger."""
+        if isinstance(letter.body, PairRequest):
+            self.requests[letter.body.epoch] = letter.body
+        robot, peer = letter.destination, letter.source
+        before = self.pair.agents[robot].state.pair(peer).base
+        answers = self.pair.deliver(letter)
+        for reply in (*answers, letter):
+            if isinstance(reply.body, PairReply) and reply.body.snapshot is not None:
+                self.replies[reply.body.epoch] = reply.body
+        after = self.pair.agents[robot].state.pair(peer).base
+        if after != before and after.met:
+            request, reply_body = self.requests[after], self.replies[after]
+            own_initiated = after.initiator == robot
+            responder = OTHER[after.initiator]
+            cross = self.ledger.at(after.initiator, after.t_meas_ns) @ self.ledger.at(responder, after.t_meas_ns).T
+            psi = self.pair.agents[robot].snapshot(peer).line
+            K, H_i, H_j, noise = gains_of(request, reply_body, psi, own_initiated, cross)
+            self.ledger.applied(robot, request, K, H_i, H_j, noise)
+            self.applied.append((after, robot))
+        return answers
+
+    def restart(self, robot: str) -> None:
+        """`robot` comes back without its factors, told from its old estimate; its own covariance is doubled."""
+        old = self.pair.agents[robot].state
+        fresh = Pair({FIRST: (old.mean, 2.0 * old.cov), SECOND: (old.mean, 2.0 * old.cov)}, timeout_s=1000.0)
+        agent = fresh.agents[robot]
+        agent.handle(Tick(self.k * NS))
+        self.pair.agents[robot] = agent
+        self.pair.lives[robot] += 1
+        self.pair.tell_life(robot, OTHER[robot])
+        self._late = [letter for letter in self._late if letter.destination != robot and letter.source != robot]
+
+
+def run(fates: tuple[str, ...], first: str, second: str) -> Story:
+    story = Story(fates)
+    story.step()
+    story.contact(WHO[first])
+    story.step()
+    story.step()
+    story.contact(WHO[second])
+    story.late()
+    story.step()
+    story.late()
+    return story
+
+
+def assert_books_exact(story: Story, note: str) -> None:
+    for name, agent in story.pair.agents.items():
+        difference = np.abs(agent.state.cov - story.ledger.cov(name, name)).max()
+        assert difference < 1e-9, f"{note}: covariance of {name} is off by {difference:.2e}"
+        np.linalg.cholesky(agent.state.cov)
+    assert len(set(story.applied)) == len(story.applied), f"{note}: a contact was applied twice by one side"
+    cross = story.pair.cross()
+    assert cross is not None, f"{note}: the correlation was lost"
+    difference = np.abs(cross - story.ledger.cov(FIRST, SECOND)).max()
+    assert difference < 1e-9, f"{note}: recovered cross-covariance is off by {difference:.2e}"
+
+
+@pytest.mark.parametrize("second", WHO)
+@pytest.mark.parametrize("first", WHO)
+def test_every_interleaving_keeps_the_books_exact(first: str, second: str) -> None:
+    runs = 0
+    for fates in product(FATES, repeat=MESSAGES):
+        note = f"{first}, {second}: {' '.join(fates)}"
+        story = run(fates, first, second)
+        assert_books_exact(story, note)
+        runs += 1
+    assert runs == len(FATES) ** MESSAGES
+
+
+@pytest.mark.parametrize("robot", [FIRST, SECOND])
+@pytest.mark.parametrize("first", WHO)
+def test_after_a_restart_claims_bound_the_truth(first: str, robot: str) -> None:
+    """The restarted robot and its peer start the pair anew; the joint covariance they claim is never too small."""
+    for fates in product(FATES, repeat=2):
+        story = Story(fates)
+        story.step()
+        story.contact(WHO[first])
+        story.restart(robot)
+        story.late()
+        cross = story.pair.cross()
+        assert cross is not None
+        claimed = np.block(
+            [
+                [story.pair.agents[FIRST].state.cov, cross],
+                [cross.T, story.pair.agents[SECOND].state.cov],
+            ]
+        )
+        true = np.block([[story.ledger.cov(a, b) for b in (FIRST, SECOND)] for a in (FIRST, SECOND)])
+        lowest = float(np.linalg.eigvalsh(claimed - true).min())
+        assert lowest > -1e-9, f"{first}, restart of {robot}: {' '.join(fates)}: too small by {-lowest:.2e}"
