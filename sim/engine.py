@@ -22,7 +22,7 @@ from agent.node import Node, Outgoing, Recorder, rejected
 from agent.sensor_input import encode
 from agent.settings import NS
 from network.links import FateRecord, LinkModel, RangeTable
-from network.messages import Packet
+from network.messages import Epoch, Packet
 from network.wire import peek_header
 from sim.agents import agent_config
 from sim.bound import BoundRunner
@@ -167,6 +167,8 @@ class VirtualEngine:
         self._sampler = Sampler(scenario, world, with_bound)
         self._bound = BoundRunner(scenario, world) if with_bound else None
         self.contacts: list[tuple[float, str, str]] = []
+        self._applied: dict[str, int] = {}
+        self._bases: dict[tuple[str, str], Epoch] = {}
         self._traffic: Counter[str] = Counter()
         self.step_us: list[float] = []
 
@@ -203,21 +205,26 @@ class VirtualEngine:
                 payload = encode(t_ns, what.kind, what.z, what.R, of=what.of, sensor=what.sensor, t0_ns=what.t0_ns)
                 self._carry_out(robot, node.on_sensor(t_ns, payload))
             elif isinstance(what, Packet):
-                self._deliver(robot, node, what)
+                self._carry_out(robot, node.on_packet(t_ns, what))
             elif self._timers.get(robot) == t_ns:
                 del self._timers[robot]
                 self._carry_out(robot, node.on_tick(t_ns))
+            self._note_contacts(robot, node)
         if self._now < end:
             self._publish_range(k)
             self._now = end
 
-    def _deliver(self, robot: str, node: Node, packet: Packet) -> None:
+    def _note_contacts(self, robot: str, node: Node) -> None:
+        """Pairs whose base contact is a new one since the last look."""
         counters = node.agent.counters
-        before = counters["pair.applied_initiator"] + counters["pair.applied_responder"]
-        out = node.on_packet(self._now, packet)
-        if counters["pair.applied_initiator"] + counters["pair.applied_responder"] > before:
-            self.contacts.append((self._now / NS, robot, packet.source))
-        self._carry_out(robot, out)
+        applied = counters["pair.applied_initiator"] + counters["pair.applied_responder"]
+        if applied == self._applied.get(robot, 0):
+            return
+        self._applied[robot] = applied
+        for peer, record in sorted(node.agent.state.pairs.items()):
+            if record.base.met and record.base != self._bases.get((robot, peer)):
+                self._bases[robot, peer] = record.base
+                self.contacts.append((self._now / NS, robot, peer))
 
     def _carry_out(self, robot: str, out: Outgoing) -> None:
         for packet in out.packets:

@@ -268,6 +268,8 @@ def check(scenario: Scenario) -> None:
     recorded = scenario.world.kind == "recording"
     if recorded and scenario.world.path is None:
         raise ConfigError(f"{scenario.name}: world.path is missing; add --set world.path=FOLDER of the recording")
+    if recorded and scenario.targets:
+        raise ConfigError(f"{scenario.name}: a recording has no targets; remove [[targets]]")
     placement = scenario.world.placement
     circling = [robot.id for robot in scenario.robots if robot.start.circle is not None]
     if placement is not None and circling and placement.reaches not in circling:
@@ -283,7 +285,10 @@ def check(scenario: Scenario) -> None:
         if robot.start.circle is not None and scenario.world.placement is None:
             raise ConfigError(f"{scenario.name}: robots.{robot.id}.start.circle needs a [world.placement]")
         for name, sensor in robot.sensors.items():
-            check_sensor(f"{scenario.name}: robots.{robot.id}.sensors.{name}", name, sensor)
+            where = f"{scenario.name}: robots.{robot.id}.sensors.{name}"
+            check_sensor(where, name, sensor)
+            if recorded and not sensor.of:
+                raise ConfigError(f"{where}: a recording holds sightings only; remove it")
     for target in scenario.targets:
         _check_sigma(f"{scenario.name}: targets.{target.id}", target)
         if target.start.pose is None:

@@ -253,6 +253,14 @@ def test_a_duplicate_is_refused_by_name_and_used_once() -> None:
     np.testing.assert_array_equal(run.result.trace.robots["r3"].mean, once.result.trace.robots["r3"].mean)
 
 
+@pytest.mark.parametrize("links", [{}, HARSH], ids=["perfect", "harsh"])
+def test_every_contact_applied_is_listed_once(links: dict[str, Any]) -> None:
+    run = Run(scenario(links))
+    for robot, counters in run.result.counters.items():
+        applied = counters.get("pair.applied_initiator", 0) + counters.get("pair.applied_responder", 0)
+        assert applied == sum(own == robot for _, own, _ in run.result.contacts) > 0
+
+
 # --- figures ----------------------------------------------------------------------------------------------
 
 

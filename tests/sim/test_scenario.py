@@ -162,8 +162,13 @@ def test_an_unknown_scenario_is_answered_with_the_nearest_name() -> None:
     assert "bundled: demo, ut-clat" in complaint(name="zzz")
 
 
-def test_a_recording_needs_its_path() -> None:
+def test_a_recording_needs_its_path_and_has_no_more_than_it_holds() -> None:
     assert "world.path" in complaint(name="utias-all")
+    path = "world.path=/somewhere"
+    target = 'targets=[{id="t1",start={pose=[0,0,0]},start_sigma={position_m=1.0,heading_rad=1.0}}]'
+    assert "remove [[targets]]" in complaint(path, target, name="utias-all")
+    gps = "robots.r1.sensors.position={sigma_m=1.0}"
+    assert "robots.r1.sensors.position: a recording holds sightings only" in complaint(path, gps, name="utias-all")
 
 
 def test_a_file_that_is_not_there_not_a_file_or_not_toml(tmp_path: Path) -> None:
