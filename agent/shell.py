@@ -287,7 +287,8 @@ class AgentShell:
         status["peers"] = {peer.peer: peer.up for peer in self._node.endpoint.peers()}
         status["rejected"] = rejected(self._node)
         status["lag_max_s"] = self._lag_ns * 1e-9
-        status["injected"] = self.config.injection is not None
+        injection = self.config.injection
+        status["injected"] = injection.links.model_dump(exclude_defaults=True) if injection is not None else {}
         if self._reader is not None:
             status["autopilot"] = self._reader.status()
         return status

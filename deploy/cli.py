@@ -113,6 +113,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Entry point; returns the exit status."""
     try:
         options = parser().parse_args(arguments)
+        options.arguments = sys.argv[1:] if arguments is None else arguments
     except SystemExit as end:
         return int(end.code or 0)
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(name)s %(levelname)s %(message)s")

@@ -7,12 +7,12 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from agent.effects import Publish
-from agent.events import Received
+from agent.effects import Effect, Publish, Send
+from agent.events import Event, Received
 from agent.recording import RecordingError, merge, read_boundary, unpack
 from agent.shell import FATE_COLUMNS
 from deploy.launch import Outcome
-from network.messages import PairReply, PairRequest
+from network.messages import PairReply, ReplyStatus
 from sim.bound import BoundRunner
 from sim.engine import Sampler, TrialResult, network_figures, sample_stride
 from sim.scenario import Scenario
@@ -85,10 +85,10 @@ def _sample(
     span = world.steps * world.step_ns
     try:
         for event, packed in read_boundary(path, robot, unfinished=True):
-            if isinstance(event, Received) and isinstance(event.message.body, PairRequest | PairReply):
-                contacts.append(((event.t_ns - t0_ns) * 1e-9, robot, event.message.header.source))
-            for data in packed:
-                effect = unpack(data)
+            made = [unpack(data) for data in packed]
+            for peer in _contacts(event, made):
+                contacts.append(((event.t_ns - t0_ns) * 1e-9, robot, peer))
+            for effect in made:
                 if isinstance(effect, Publish):
                     settle(effect.estimate.t_ns - t0_ns)
                     latest = effect.estimate
@@ -96,6 +96,20 @@ def _sample(
             settle(min(latest.t_ns - t0_ns + behind, span + 2 * ahead))
     except RecordingError:
         return
+
+
+def _contacts(event: Event, effects: list[Effect]) -> list[str]:
+    """Peers whose contact was used here: requests answered with OK (perhaps later), and accepted replies."""
+    peers = [
+        effect.peer
+        for effect in effects
+        if isinstance(effect, Send) and isinstance(effect.body, PairReply) and effect.body.status is ReplyStatus.OK
+    ]
+    if isinstance(event, Received):
+        body, used = event.message.body, any(isinstance(effect, Publish) for effect in effects)
+        if isinstance(body, PairReply) and body.status is ReplyStatus.OK and used:
+            peers.append(event.message.header.source)
+    return peers
 
 
 def _fates(scenario: Scenario, run_dir: Path) -> list[dict[str, str]]:

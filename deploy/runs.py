@@ -179,7 +179,7 @@ def _run_virtual(scenario: Scenario, options: argparse.Namespace, world: Any, ru
 
 
 def _finish(scenario: Scenario, run_dir: Path, summary: dict[str, Any], options: argparse.Namespace) -> None:
-    (run_dir / "command.txt").write_text(shlex.join(["cofix", *sys.argv[1:]]) + "\n")
+    (run_dir / "command.txt").write_text(shlex.join(["cofix", *options.arguments]) + "\n")
     temporary = run_dir / "summary.tmp"
     temporary.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
     temporary.replace(run_dir / "summary.json")

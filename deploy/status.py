@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
@@ -16,6 +17,10 @@ from sim.scenario import Scenario
 
 if TYPE_CHECKING:
     from deploy.launch import Launcher
+
+
+LIVE_TEXT = ("agent", "process", "neighbours")
+LIVE_NUMBERS = ("x [m]", "y [m]", "sigma [m]", "contacts", "rejected", "lag [s]")
 
 
 class Progress:
@@ -73,19 +78,18 @@ class LiveTable:
         """The present state as a table."""
         played = launcher.progress() * self._scenario.duration_s
         title = f"{self._scenario.name}  {played:.0f} / {self._scenario.duration_s:.0f} s  at {self._speed:g} x"
-        table = Table(title=title, title_justify="left")
-        for name in (
-            "agent",
-            "process",
-            "x [m]",
-            "y [m]",
-            "sigma [m]",
-            "neighbours",
-            "contacts",
-            "rejected",
-            "lag [s]",
-        ):
-            table.add_column(name, justify="left" if name in ("agent", "process", "neighbours") else "right")
+        links = self._scenario.links.model_dump(exclude_defaults=True)
+        injected = ", ".join(f"{name} {value:g}" for name, value in links.items())
+        table = Table(
+            title=title,
+            title_justify="left",
+            caption=f"injected at every receiver: {injected}" if injected else None,
+            caption_justify="left",
+        )
+        for name in LIVE_TEXT:
+            table.add_column(escape(name))
+        for name in LIVE_NUMBERS:
+            table.add_column(escape(name), justify="right")
         for robot in self._scenario.robots:
             member = launcher.members.get(robot.id)
             if member is None:
@@ -95,19 +99,21 @@ class LiveTable:
 
 
 def _cells(exit_code: int | None, status: dict[str, Any]) -> list[str]:
+    """A row of the live table after the agent's name."""
+    blank = [""] * (len(LIVE_TEXT) + len(LIVE_NUMBERS) - 2)
     if exit_code is not None:
-        return [f"[red]ended ({exit_code})[/red]"] + [""] * 7
+        return [f"[red]ended ({exit_code})[/red]", *blank]
     if "x_m" not in status:
-        return ["starting"] + [""] * 7
+        return ["starting", *blank]
     counters = status.get("counters", {})
     contacts = counters.get("pair.applied_initiator", 0) + counters.get("pair.applied_responder", 0)
     peers = " ".join(peer for peer, up in sorted(status.get("peers", {}).items()) if up)
     return [
-        "running" + (" (faults injected)" if status.get("injected") else ""),
+        "running",
+        peers or "none heard",
         f"{status['x_m']:.2f}",
         f"{status['y_m']:.2f}",
         f"{status['sigma_m']:.2f}",
-        peers or "none heard",
         str(contacts),
         str(sum(status.get("rejected", {}).values())),
         f"{status['lag_s']:.2f}",
@@ -124,7 +130,7 @@ def print_summary(summary: dict[str, Any], run_dir: Path, report: Path | None) -
     table = Table(title=head, title_justify="left")
     columns = ("robot", "RMSE [m]", "max [m]", "heading RMSE [rad]", "ANEES", "inside 3σ")
     for name in columns:
-        table.add_column(name, justify="left" if name == "robot" else "right")
+        table.add_column(escape(name), justify="left" if name == "robot" else "right")
     for robot, entry in summary["robots"].items():
         table.add_row(
             robot,

@@ -70,7 +70,7 @@ class TrialResult:
 
 def sample_stride(step_ns: int) -> int:
     """Steps between two samples of the figures: every step, but at most once per second."""
-    return max(1, round(NS / step_ns))
+    return max(1, -(-NS // step_ns))
 
 
 class Sampler:

@@ -162,7 +162,9 @@ class Ledger:
         return np.asarray(self.error[first] @ self.error[second].T)
 
 
-def gains_of(request: PairRequest, reply: PairReply, psi: Array, own_initiated: bool, cross: Array) -> tuple[Array, ...]:
+def gains_of(
+    request: PairRequest, reply: PairReply, psi: Array, own_initiated: bool, cross: Array
+) -> tuple[Array, ...]:
     """(K, H_i, H_j, R) of a contact from both snapshots, written down independently of the product code."""
     assert reply.snapshot is not None
     (item,) = request.measurements

@@ -50,6 +50,7 @@ sensors = { range = { of = ["peers"], sigma_m = 0.1 } }
 """
 
 SEED = "5"
+COFIX = (sys.executable, "-P", "-m", "deploy.cli")
 RANDOM_FATE = ("lost", "delay_ns", "duplicate")
 
 
@@ -61,8 +62,7 @@ class Run:
         scenario.write_text(SCENARIO)
         self.directory = folder / out
         self.process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "deploy.cli", "run", str(scenario), "--seed", SEED, "--json"]
-            + ["--out", str(self.directory), *options],
+            [*COFIX, "run", str(scenario), "--seed", SEED, "--json", "--out", str(self.directory), *options],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -172,7 +172,7 @@ def test_processes_agree_with_virtual_time(tmp_path: Path) -> None:
     for name in ("summary.json", "report.html", "recording.mcap", "scenario.toml", "agents/r1.toml"):
         assert (run.directory / name).stat().st_size > 0
     replayed = subprocess.run(
-        [sys.executable, "-P", "-m", "deploy.cli", "replay", str(run.directory / "recording.mcap")],
+        [*COFIX, "replay", str(run.directory / "recording.mcap")],
         capture_output=True,
         text=True,
         timeout=60,
