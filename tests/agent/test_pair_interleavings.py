@@ -7,12 +7,15 @@ and when. After a restart they must bound them.
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from agent.core import Agent
 from agent.estimation.observation import RelativeModel
 from agent.events import Tick
 from agent.settings import NS
@@ -37,8 +40,8 @@ OTHER = {FIRST: SECOND, SECOND: FIRST}
 class Story:
     """Two contacts of a pair, with a fate for each of the first four messages; then a clean third contact."""
 
-    def __init__(self, fates: tuple[str, ...]) -> None:
-        self.pair = Pair(STARTS, timeout_s=1000.0, horizon_s=1000.0)
+    def __init__(self, fates: tuple[str, ...], timeout_s: float = 1000.0) -> None:
+        self.pair = Pair(STARTS, timeout_s=timeout_s, horizon_s=1000.0)
         self.ledger = Ledger(STARTS)
         self.requests: dict[Epoch, PairRequest] = {}
         self.replies: dict[Epoch, PairReply] = {}
@@ -49,13 +52,15 @@ class Story:
         self.pair.tell_life(FIRST, SECOND)
         self.pair.tell_life(SECOND, FIRST)
 
-    def step(self) -> None:
-        """Both robots drive one second."""
+    def step(self) -> list[Letter]:
+        """Both robots drive one second; returns what they send."""
         self.k += 1
+        letters = []
         for name, agent in self.pair.agents.items():
             delta = np.array([0.3, 0.1, 0.0, 0.0])
             self.ledger.moved(name, float(agent.state.mean[2]), delta, NOISE)
-            self.pair.odometry(name, (self.k - 1) * NS, self.k * NS, delta, NOISE)
+            letters += self.pair.odometry(name, (self.k - 1) * NS, self.k * NS, delta, NOISE)
+        return letters
 
     def contact(self, who: tuple[str, ...]) -> None:
         """Those named measure the other; their letters and what follows meet their fates."""
@@ -65,15 +70,16 @@ class Story:
             own, other = self.pair.agents[name].state.mean, self.pair.agents[OTHER[name]].state.mean
             z = RelativeModel("range_bearing", 3).h(np.concatenate([own, other])) + np.array([0.05, -0.02])
             letters += self.pair.measure(name, self.k * NS, "range_bearing", z, R)
-        self._travel(letters)
+        self.travel(letters)
 
     def late(self) -> None:
         """What was held back arrives, the newest first."""
         held, self._late = self._late[::-1], []
         for letter in held:
-            self._travel(self._handed(letter))
+            self.travel(self._handed(letter))
 
-    def _travel(self, letters: list[Letter]) -> None:
+    def travel(self, letters: list[Letter]) -> None:
+        """Letters and what follows from them, each with its fate."""
         while letters:
             following: list[Letter] = []
             for letter in letters:
@@ -177,3 +183,41 @@ def test_after_a_restart_claims_bound_the_truth(first: str, robot: str) -> None:
         true = np.block([[story.ledger.cov(a, b) for b in (FIRST, SECOND)] for a in (FIRST, SECOND)])
         lowest = float(np.linalg.eigvalsh(claimed - true).min())
         assert lowest > -1e-9, f"{first}, restart of {robot}: {' '.join(fates)}: too small by {-lowest:.2e}"
+
+
+def test_an_instant_that_has_left_the_ring_is_answered_too_old() -> None:
+    """The request comes when the responder's history no longer reaches back: nobody uses it, nothing is lost."""
+    story = Story(("late",))
+    responder = story.pair.agents[SECOND]
+    short = replace(responder.settings, lateness=replace(responder.settings.lateness, horizon_ns=2 * NS))
+    story.pair.agents[SECOND] = Agent(short)
+    story.pair.tell_life(FIRST, SECOND)
+    story.step()
+    story.contact(WHO["first"])
+    for _ in range(5):
+        story.step()
+    story.late()
+    assert responder_counters(story)["pair.too_old"] == 1
+    assert story.pair.agents[FIRST].counters["pair.answer_too_old"] == 1
+    assert story.pair.agents[FIRST].state.pair(SECOND).lines == ()
+    assert story.applied == []
+    story.contact(WHO["first"])
+    assert len(story.applied) == 2
+    assert_books_exact(story, "after too old")
+
+
+def responder_counters(story: Story) -> Counter[str]:
+    return story.pair.agents[SECOND].counters
+
+
+@pytest.mark.parametrize("lost", [("lost",), ("now", "lost")])
+def test_a_repeated_request_completes_the_contact_exactly(lost: tuple[str, ...]) -> None:
+    """Request or reply lost: the same request goes out again after the time-out, and both sides use it once."""
+    story = Story(lost, timeout_s=1.0)
+    story.step()
+    story.contact(WHO["first"])
+    again = story.step()
+    assert len(again) == 1
+    story.travel(again)
+    assert sorted(robot for _, robot in story.applied) == [FIRST, SECOND]
+    assert_books_exact(story, f"repeated after {lost}")
