@@ -22,7 +22,8 @@ from typing import Any
 import msgpack
 
 from agent.autopilot import AutopilotReader
-from agent.config import AgentConfig, ConfigError
+from agent.config import AgentConfig
+from agent.config_file import ConfigError
 from agent.control import ControlLine
 from agent.effects import Estimate
 from agent.events import Event

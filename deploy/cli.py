@@ -125,7 +125,7 @@ def main(arguments: list[str] | None = None) -> int:
         "replay": _replay,
         "report": _report,
     }
-    from agent.config import ConfigError
+    from agent.config_file import ConfigError
 
     try:
         return handlers[options.command](options)

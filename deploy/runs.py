@@ -14,7 +14,8 @@ from typing import Any
 
 import tomli_w
 
-from agent.config import AgentConfig, ConfigError
+from agent.config import AgentConfig
+from agent.config_file import ConfigError
 from agent.node import Recorder
 from agent.recording import RecordingWriter
 from agent.settings import NS

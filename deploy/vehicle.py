@@ -11,7 +11,7 @@ import time
 
 import numpy as np
 
-from agent.config import ConfigError
+from agent.config_file import ConfigError
 from agent.estimation.motion import compose
 from agent.fleet_clock import FleetClock
 from agent.mavlink import MavlinkError

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from agent.config import AgentConfig, validate
+from agent.config import AgentConfig
+from agent.config_file import validate
 from sim.scenario import RobotPart, Scenario, sensor_kind
 from sim.world import World, control_odometry
 

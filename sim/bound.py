@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.config import target_motion
+from agent.config_parts import target_motion
 from agent.estimation.motion import LAYOUTS
 from agent.events import Odometry
 from agent.settings import CoastSettings

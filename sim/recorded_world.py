@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.config import ConfigError
+from agent.config_file import ConfigError
 from agent.settings import NS, nanoseconds
 from agent.timeline import Phase
 from sim.recordings.utias import Recording, load

@@ -10,29 +10,31 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from agent.config import (
-    CoastPart,
+from agent.config_file import (
     ConfigError,
-    ControlNoisePart,
-    ControlPart,
     Finite,
     Id,
+    NotNegative,
+    P,
+    Part,
+    Positive,
+    Vector2,
+    Vector3,
+    read_toml,
+    validate,
+)
+from agent.config_parts import (
+    CoastPart,
+    ControlNoisePart,
+    ControlPart,
     LandmarkPart,
     LatenessPart,
     LinksPart,
     LocalizationPart,
     NetworkPart,
-    NotNegative,
     OdometryPart,
-    P,
-    Part,
-    Positive,
     SigmaPart,
     TrackingPart,
-    Vector2,
-    Vector3,
-    read_toml,
-    validate,
 )
 
 Subject = Literal["peers", "landmarks", "targets"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from agent.config import ConfigError
+from agent.config_file import ConfigError
 from agent.node import Recorder
 from sim.engine import FateSink, TrialResult, VirtualEngine
 from sim.recorded_world import RecordedWorld

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.config import ConfigError
+from agent.config_file import ConfigError
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import LAYOUTS, compose, velocity_step
 from agent.estimation.observation import RELATIVE_ANGLES, RelativeModel

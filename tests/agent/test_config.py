@@ -10,15 +10,9 @@ import numpy as np
 import pytest
 import tomli_w
 
-from agent.config import (
-    AgentConfig,
-    ConfigError,
-    LocalizationPart,
-    OdometryPart,
-    SigmaPart,
-    load_agent_config,
-    validate,
-)
+from agent.config import AgentConfig, load_agent_config
+from agent.config_file import ConfigError, validate
+from agent.config_parts import LocalizationPart, OdometryPart, SigmaPart
 
 
 def example(**change: Any) -> dict[str, Any]:

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.config import AgentConfig, validate
+from agent.config import AgentConfig
+from agent.config_file import validate
 from agent.core import Agent
 from agent.effects import Alarm, Broadcast, Effect, Estimate, Publish, Send, TrackEstimate
 from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received, Tick

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from agent.config import ConfigError
+from agent.config_file import ConfigError
 from sim.bound import BoundRunner
 from sim.engine import TrialResult
 from sim.metrics import nees

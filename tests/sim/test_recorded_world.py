@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agent.config import ConfigError
+from agent.config_file import ConfigError
 from agent.timeline import Phase
 from sim.recorded_world import RecordedWorld
 from sim.scenario import Scenario, check

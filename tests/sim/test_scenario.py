@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from agent.config import ConfigError
+from agent.config_file import ConfigError
 from sim.scenario import Scenario, apply_override, bundled, load, locate
 
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from agent.config import ConfigError
+from agent.config_file import ConfigError
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import LAYOUTS, between, velocity_step
 from agent.timeline import Phase

@@ -1,0 +1,184 @@
+"""Parts that the file of a scenario and that of an agent have in common."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+
+from agent.config_file import ConfigError, Finite, Id, LandmarkId, NotNegative, Part, Positive, Share, Vector2
+from agent.estimation.motion import LAYOUTS, TargetMotion
+from agent.estimation.odometry import OdometryNoise
+from agent.settings import CoastSettings, LatenessSettings, LocalizationSettings, TargetSettings, nanoseconds
+from network.endpoint import EndpointSettings
+from network.links import LinkSettings
+
+
+class LocalizationPart(Part):
+    kind: Literal["clat"] = "clat"
+    form: Literal["safe", "published"] = "safe"
+    transform: Literal["unscented", "linearized", "jacobian"] = "unscented"
+    correlation: Literal["factors", "ignored"] = "factors"
+    pair_interval_s: NotNegative | None = None
+    pair_timeout_s: Positive = 2.0
+    innovation_cap: NotNegative = 0.0
+
+    def settings(self) -> LocalizationSettings:
+        """`safe` uses a contact of a pair every 3 s and trace weights; `published` every one and log det."""
+        safe = self.form == "safe"
+        interval_s = self.pair_interval_s if self.pair_interval_s is not None else (3.0 if safe else 0.0)
+        return LocalizationSettings(
+            form=self.form,
+            transform=self.transform,
+            correlation=self.correlation,
+            sighting_weight="trace" if safe else "logdet",
+            fusion_weight="fast" if safe else "logdet",
+            pair_interval_ns=nanoseconds(interval_s),
+            pair_timeout_ns=nanoseconds(self.pair_timeout_s),
+            innovation_cap=self.innovation_cap,
+        )
+
+
+class TrackingPart(Part):
+    kind: Literal["clat", "none"] = "clat"
+
+
+class LatenessPart(Part):
+    kind: Literal["compensate", "discard"] = "compensate"
+    settle_s: NotNegative = 0.0
+    tolerance_s: NotNegative = 0.001
+    horizon_s: Positive = 5.0
+    odometry_wait_s: NotNegative = 1.0
+    clock_sigma_s: NotNegative = 0.0
+
+    def settings(self) -> LatenessSettings:
+        return LatenessSettings(
+            kind=self.kind,
+            settle_ns=nanoseconds(self.settle_s),
+            tolerance_ns=nanoseconds(self.tolerance_s),
+            horizon_ns=nanoseconds(self.horizon_s),
+            odometry_wait_ns=nanoseconds(self.odometry_wait_s),
+            clock_sigma_ns=nanoseconds(self.clock_sigma_s),
+        )
+
+
+class CoastPart(Part):
+    speed_mps: Positive = 0.5
+    yaw_rate_radps: Positive = 0.5
+
+    def settings(self) -> CoastSettings:
+        return CoastSettings(self.speed_mps, self.yaw_rate_radps)
+
+
+class NetworkPart(Part):
+    hello_period_s: Positive = 0.5
+    silent_after_s: Positive = 3.0
+
+    def settings(self, horizon_s: float) -> EndpointSettings:
+        return EndpointSettings(
+            hello_period_ns=nanoseconds(self.hello_period_s),
+            silent_after_ns=nanoseconds(self.silent_after_s),
+            horizon_ns=nanoseconds(horizon_s),
+        )
+
+
+class LinksPart(Part):
+    """Link model. `range_m` absent: everybody hears everybody."""
+
+    range_m: Positive | None = None
+    hysteresis_m: NotNegative = 0.0
+    loss: Share = 0.0
+    delay_s: NotNegative = 0.0
+    delay_tail_s: NotNegative = 0.0
+    duplicate: Share = 0.0
+
+    def settings(self, seed: int) -> LinkSettings:
+        return LinkSettings(seed=seed, **self.model_dump())
+
+
+class SigmaPart(Part):
+    """Standard deviations of an initial belief."""
+
+    position_m: Positive
+    heading_rad: Positive | None = None
+    velocity_mps: Positive | None = None
+
+    def covariance(self, model: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """Diagonal covariance of a state of `model`."""
+        layout = LAYOUTS[model]
+        rest = self.heading_rad if layout.heading is not None else self.velocity_mps
+        if rest is None:
+            key = "heading_rad" if layout.heading is not None else "velocity_mps"
+            raise ConfigError(f"start_sigma.{key} is missing: the model '{model}' needs it")
+        return np.diag([self.position_m**2] * 2 + [rest**2] * (layout.dim - 2))
+
+
+class ControlPart(Part):
+    speed_mps: Finite = 0.0
+    yaw_rate_radps: Finite = 0.0
+
+
+class ControlNoisePart(Part):
+    """White noise on a control, held over the scenario's step (1 sigma)."""
+
+    speed_mps: NotNegative = 0.0
+    yaw_rate_radps: NotNegative = 0.0
+    acceleration_mps2: NotNegative = 0.0
+
+
+class OdometryPart(Part):
+    """Random-walk rates and calibrated gains of an odometry; see `agent.estimation.odometry`."""
+
+    along_m_per_sqrt_s: NotNegative = 0.02
+    along_m_per_sqrt_m: NotNegative = 0.0
+    across_m_per_sqrt_s: NotNegative = 0.0
+    vertical_m_per_sqrt_s: NotNegative = 0.02
+    heading_rad_per_sqrt_s: NotNegative = 0.005
+    heading_rad_per_sqrt_rad: NotNegative = 0.0
+    scale_along: Positive = 1.0
+    scale_turn: Positive = 1.0
+
+    def noise(self) -> OdometryNoise:
+        return OdometryNoise(**self.model_dump())
+
+
+class AgentTargetPart(Part):
+    """A target as a tracker knows it: common prior and model."""
+
+    id: Id
+    model: Literal["unicycle", "constant_velocity", "damped_velocity"]
+    mean: list[Finite]
+    start_sigma: SigmaPart
+    control: ControlPart = ControlPart()
+    noise: ControlNoisePart = ControlNoisePart()
+    noise_step_s: Positive = 1.0
+    damping_s: Positive = 2.0
+
+    def settings(self) -> TargetSettings:
+        layout = LAYOUTS[self.model]
+        if len(self.mean) != layout.dim:
+            raise ConfigError(f"targets.{self.id}.mean needs {layout.dim} numbers for the model '{self.model}'")
+        return TargetSettings(
+            self.id,
+            target_motion(self.model, self.control, self.noise, self.noise_step_s, self.damping_s),
+            np.array(self.mean),
+            self.start_sigma.covariance(self.model),
+        )
+
+
+def target_motion(
+    model: str, control: ControlPart, noise: ControlNoisePart, noise_step_s: float, damping_s: float
+) -> TargetMotion:
+    """The motion model a table describes."""
+    if LAYOUTS[model].heading is not None:
+        sigma = (noise.speed_mps, noise.yaw_rate_radps)
+    else:
+        sigma = (noise.acceleration_mps2, noise.acceleration_mps2)
+    return TargetMotion(LAYOUTS[model], (control.speed_mps, control.yaw_rate_radps), sigma, noise_step_s, damping_s)
+
+
+class LandmarkPart(Part):
+    """A point of known position, a UWB anchor for instance: x, y [m] in the fleet's ENU frame."""
+
+    id: LandmarkId
+    position: Vector2
