@@ -151,7 +151,7 @@ class Pairs:
         request = event.message.body
         assert isinstance(request, PairRequest)
         epoch = request.epoch
-        if epoch.initiator != peer or not self._plausible(request):
+        if epoch.initiator != peer or not self._fits(request.snapshot) or not _known_kinds(request):
             self._counters["pair.malformed"] += 1
             return state
         exchange = self.exchange(peer)
@@ -187,7 +187,7 @@ class Pairs:
             return state
         if step is not Step.APPLY or pending is None or reply.snapshot is None:
             return state
-        if reply.snapshot.belief.model != self._settings.layout.name:
+        if not self._fits(reply.snapshot):
             self._counters["pair.malformed"] += 1
             return state
         sent = pending.request
@@ -237,10 +237,16 @@ class Pairs:
 
     # -- estimation -----------------------------------------------------------------------------------------
 
-    def _plausible(self, request: PairRequest) -> bool:
+    def _fits(self, told: Snapshot) -> bool:
+        """Whether a peer's snapshot is of the model and the sizes that the pair's algebra needs."""
         layout = self._settings.layout
-        return request.snapshot.belief.model == layout.name and all(
-            item.kind in RELATIVE_ANGLES for item in request.measurements
+        square = (layout.dim, layout.dim)
+        return (
+            told.belief.model == layout.name
+            and told.belief.cov.shape == square
+            and (not told.base.met or told.factor.shape == square)
+            and told.line.shape == square
+            and all(line.matrix.shape == square for line in told.lines)
         )
 
     def offset_ns(self, event: Received) -> int:
@@ -337,3 +343,7 @@ class Pairs:
                 cov = symmetrize(own.cov - gain @ own.cov)
             targets[told.target] = TargetState(mean, cov)
         return replace(state, targets=targets) if targets else state
+
+
+def _known_kinds(request: PairRequest) -> bool:
+    return all(item.kind in RELATIVE_ANGLES for item in request.measurements)
