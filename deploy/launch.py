@@ -250,7 +250,7 @@ class Launcher:
         while not all(member.ready for member in self.members.values()):
             for member in self.members.values():
                 if member.exit_code is not None:
-                    raise LaunchError(f"{member.name} ended before the start: {last_line(member.log)}")
+                    raise LaunchError(f"{member.name} {ended(member.exit_code, member.log)} before the start")
             if self._interrupted:
                 raise LaunchError("interrupted before the start")
             if time.monotonic() > deadline:
@@ -269,7 +269,7 @@ class Launcher:
         reported: list[str] = []
         while world.done is None and not self._interrupted:
             if world.exit_code is not None:
-                raise LaunchError(f"the world {describe_exit(world.exit_code)}: {last_line(world.log)}")
+                raise LaunchError(f"the world {ended(world.exit_code, world.log)}; all agents are stopped")
             for member in self.members.values():
                 told = self._trouble(member)
                 if told is not None and member.name not in reported:
@@ -286,8 +286,7 @@ class Launcher:
     def _trouble(member: Member) -> str | None:
         """What is wrong with a process, if anything."""
         if member.exit_code is not None:
-            reason = last_line(member.log)
-            return describe_exit(member.exit_code) + (f" ({reason})" if reason else "")
+            return ended(member.exit_code, member.log)
         if time.monotonic() - member.heard_s > SILENT_S:
             return f"has not answered for {SILENT_S:.0f} s"
         return None
@@ -345,6 +344,12 @@ def describe_exit(code: int) -> str:
         except ValueError:
             return f"was ended by signal {-code}"
     return f"ended with exit status {code}"
+
+
+def ended(code: int, log: Path) -> str:
+    """How a process ended, with the last thing it said."""
+    said = last_line(log)
+    return describe_exit(code) + (f" ({said})" if said else "")
 
 
 def last_line(log: Path) -> str:
