@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import pty
 import time
 import tty
+from collections import Counter
 from collections.abc import Callable
 from itertools import pairwise
 
@@ -17,7 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from agent.autopilot import AutopilotReader, AutopilotSettings, Output
 from agent.events import Fix, Odometry
 from agent.fleet_clock import FleetClock
-from agent.mavlink import MavlinkError, MavlinkLink, parse_endpoint
+from agent.mavlink import MavlinkError, MavlinkLink, SerialLine, parse_endpoint
 from network.transport import free_port
 from sim.autopilot import StandIn, StandInServer, StandInSettings
 
@@ -191,6 +193,38 @@ def test_increments_over_a_serial_line() -> None:
             assert hearing.counters["link.lost"] == 1 and not link.connected
         finally:
             await link.close()
+
+    asyncio.run(scene())
+
+
+def test_a_serial_line_that_does_not_keep_up_loses_whole_frames_only() -> None:
+    async def scene() -> None:
+        master, slave = pty.openpty()
+        tty.setraw(master)
+        os.set_blocking(master, False)
+        counters: Counter[str] = Counter()
+        line = SerialLine(
+            parse_endpoint(f"serial:{os.ttyname(slave)}:57600"), lambda data: True, lambda: None, counters
+        )
+        await line.start()
+        try:
+            await until(lambda: line.connected)
+            for k in range(1000):
+                line.send(k.to_bytes(4, "big") * 64)
+            kept = 1000 - counters["link.send_dropped"]
+            assert 100 < kept < 1000
+            got = bytearray()
+
+            def read() -> None:
+                with contextlib.suppress(BlockingIOError):
+                    got.extend(os.read(master, 65536))
+
+            await until(lambda: len(got) >= kept * 256, read)
+            assert got == b"".join(k.to_bytes(4, "big") * 64 for k in range(kept))
+        finally:
+            await line.close()
+            os.close(slave)
+            os.close(master)
 
     asyncio.run(scene())
 
