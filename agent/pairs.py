@@ -26,6 +26,7 @@ from agent.settings import AgentSettings
 from network.messages import (
     MAX_LINES,
     MAX_MEASUREMENTS,
+    MAX_MESSAGE_BYTES,
     MAX_TARGETS,
     NEVER,
     Belief,
@@ -38,6 +39,7 @@ from network.messages import (
     Snapshot,
     TargetBelief,
 )
+from network.wire import size_bound
 
 Array = NDArray[np.float64]
 
@@ -114,6 +116,19 @@ class Pairs:
             record.known,
         )
 
+    def _fitting(self, snapshot: Snapshot, measurements: tuple[Measurement, ...]) -> Snapshot:
+        """The snapshot without what does not fit into one message: targets first, then the oldest lines."""
+        longest = Epoch(2**62, "r" * 24, 2**53)
+        while (snapshot.targets or snapshot.lines) and (
+            size_bound(PairRequest(longest, measurements, snapshot)) > MAX_MESSAGE_BYTES
+        ):
+            self._counters["pair.shortened"] += 1
+            if snapshot.targets:
+                snapshot = replace(snapshot, targets=snapshot.targets[:-1])
+            else:
+                snapshot = replace(snapshot, lines=snapshot.lines[1:])
+        return snapshot
+
     # -- what happens to a pair -----------------------------------------------------------------------------
 
     def measured(
@@ -137,7 +152,7 @@ class Pairs:
             return state, None
         then, psi = found
         told = tuple(self._with_clock_noise(peer, item) for item in measurements[:MAX_MEASUREMENTS])
-        request = exchange.open(t_ns, now_ns, told, self.snapshot(then, peer))
+        request = exchange.open(t_ns, now_ns, told, self._fitting(self.snapshot(then, peer), told))
         self._counters["pair.started"] += 1
         state = state.with_line(peer, request.epoch, psi, self._settings.localization.max_lines)
         history.updated(state)
@@ -170,7 +185,7 @@ class Pairs:
             effects.append(Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.TOO_OLD))))
             return state
         then, psi = found
-        own = self.snapshot(then, peer)
+        own = self._fitting(self.snapshot(then, peer), ())
         effects.append(Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.OK, own))))
         state = state.with_line(peer, epoch, psi, self._settings.localization.max_lines)
         history.updated(state)

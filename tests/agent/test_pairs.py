@@ -10,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agent.core import Agent
+from agent.estimation.motion import UNICYCLE, TargetMotion
 from agent.events import LinkChange, Received
-from agent.settings import NS, AgentSettings, LatenessSettings, LocalizationSettings
+from agent.settings import NS, AgentSettings, LatenessSettings, LocalizationSettings, TargetSettings
 from network.messages import (
+    MAX_MESSAGE_BYTES,
     Belief,
     Epoch,
     Header,
@@ -24,6 +26,7 @@ from network.messages import (
     ReplyStatus,
     Snapshot,
 )
+from network.wire import encode
 from tests.agent.courier import FIRST, SECOND, Pair
 
 STARTS = {
@@ -168,3 +171,23 @@ def test_a_clock_that_is_off_is_mapped_and_its_doubt_widens_the_noise() -> None:
     # The instant on r1's clock: 1 s - 0.4 s x 1 / 1.01 (the share of the measured offset).
     at_s = 1.0 - 0.4 / 1.01
     assert snapshot.belief.mean[0] == pytest.approx(0.3 * np.cos(0.3) * at_s, abs=1e-3)
+
+
+def test_many_targets_do_not_silence_a_pair() -> None:
+    """Eight targets do not fit into one message: those that do are told, and the contact goes on."""
+    pair = met_pair(until_s=1)
+    motion = TargetMotion(UNICYCLE)
+    targets = tuple(
+        TargetSettings(f"a-target-with-a-long-id{k}", motion, np.array([k, 0.0, 0.0]), np.eye(3)) for k in range(8)
+    )
+    agents = {}
+    for name, agent in pair.agents.items():
+        many = replace(agent.settings, targets=targets, track=True, mean=agent.state.mean, start_ns=NS)
+        agents[name] = Agent(many)
+    pair.agents = agents
+    (letter,) = pair.measure(FIRST, NS, "range", np.array([6.1]), np.array([[0.01]]))
+    header = Header(FIRST, 2**53, 2**53, 2**53, letter.t_meas_ns, 2**62)
+    assert 1 <= len(letter.body.snapshot.targets) < 8
+    assert len(encode(header, letter.body)) <= MAX_MESSAGE_BYTES
+    pair.converse([letter])
+    assert pair.agents[FIRST].counters["pair.applied_initiator"] == 1
