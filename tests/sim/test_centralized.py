@@ -1,0 +1,102 @@
+"""The centralized filter against a joint Kalman filter written out here."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from agent.estimation.gaussian import wrap
+from agent.estimation.motion import UNICYCLE, TargetMotion
+from agent.estimation.observation import RelativeModel
+from sim.centralized import CentralizedFilter
+
+Array = NDArray[np.float64]
+
+ROBOTS = {
+    "r1": (np.array([0.0, 0.0, 0.3]), np.diag([0.3, 0.2, 0.01]), UNICYCLE),
+    "r2": (np.array([6.0, 2.0, -1.0]), np.diag([0.4, 0.5, 0.02]), UNICYCLE),
+}
+MOTION = TargetMotion(UNICYCLE, (0.1, 0.02), (0.05, 0.03), 1.0)
+TARGETS = {"t1": (np.array([3.0, -4.0, 0.8]), np.diag([0.6, 0.6, 0.05]), MOTION)}
+LANDMARKS = {"L1": (9.0, -2.0)}
+START = {"r1": 0, "r2": 3, "t1": 6}
+NOISE = np.diag([0.01, 0.02, 0.0, 0.001])
+
+
+class JointFilter:
+    """An EKF over nine states."""
+
+    def __init__(self) -> None:
+        everybody = [ROBOTS["r1"], ROBOTS["r2"], TARGETS["t1"]]
+        self.x = np.concatenate([mean for mean, _, _ in everybody])
+        self.P = np.zeros((9, 9))
+        for index, (_, cov, _) in enumerate(everybody):
+            self.P[3 * index : 3 * index + 3, 3 * index : 3 * index + 3] = cov
+
+    def move(self, name: str, step: Array, noise: Array) -> None:
+        at = START[name]
+        cos, sin = np.cos(self.x[at + 2]), np.sin(self.x[at + 2])
+        turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        world = turn @ step
+        F = np.eye(9)
+        F[at, at + 2], F[at + 1, at + 2] = -world[1], world[0]
+        self.x[at : at + 3] += world
+        self.P = F @ self.P @ F.T
+        self.P[at : at + 3, at : at + 3] += turn @ noise @ turn.T
+        self.x[[2, 5, 8]] = wrap(self.x[[2, 5, 8]])
+
+    def update(self, H: Array, innovation: Array, R: Array) -> None:
+        K = np.linalg.solve(H @ self.P @ H.T + R, H @ self.P).T
+        self.x = self.x + K @ innovation
+        self.P = (np.eye(9) - K @ H) @ self.P @ (np.eye(9) - K @ H).T + K @ R @ K.T
+        self.x[[2, 5, 8]] = wrap(self.x[[2, 5, 8]])
+
+
+def test_it_is_the_joint_filter() -> None:
+    rng = np.random.default_rng(21)
+    ours, joint = CentralizedFilter(ROBOTS, TARGETS, LANDMARKS, "jacobian"), JointFilter()
+    for step in range(150):
+        for name in ROBOTS:
+            delta = np.array([rng.uniform(0.0, 0.4), rng.uniform(-0.1, 0.1), 0.0, rng.uniform(-0.2, 0.2)])
+            ours.odometry(name, delta, NOISE)
+            joint.move(name, delta[[0, 1, 3]], NOISE[np.ix_((0, 1, 3), (0, 1, 3))])
+        ours.drift_targets(1.0)
+        joint.move("t1", np.array([0.1, 0.0, 0.02]), np.diag([0.05**2, 0.0, 0.03**2]))
+        robot = ("r1", "r2")[int(rng.integers(2))]
+        of = ("r2" if robot == "r1" else "r1", "target:t1", "landmark:L1")[int(rng.integers(3))]
+        kind = ("range", "bearing", "range_bearing")[int(rng.integers(3))]
+        mount = (0.2, -0.1, 0.5)
+        landmark = LANDMARKS["L1"] if of.startswith("landmark") else None
+        model = RelativeModel(kind, 3, mount, landmark)
+        rows = list(range(START[robot], START[robot] + 3))
+        if landmark is None:
+            other = START[of.removeprefix("target:")]
+            rows += list(range(other, other + 3))
+        predicted = model.h(joint.x[rows])
+        R = np.diag(np.full(len(predicted), 0.01))
+        z = predicted + rng.normal(size=len(predicted)) * 0.05
+        H = np.zeros((len(z), 9))
+        H[:, rows] = model.jacobian(joint.x[rows])
+        ours.observe(robot, kind, of, z, R, mount)
+        joint.update(H, z - predicted, R)
+        if step % 7 == 0:
+            fix, noise = joint.x[:2] + rng.normal(size=2) * 0.1, np.diag([0.04, 0.04])
+            ours.fix("r1", "position", fix, noise)
+            joint.update(np.eye(2, 9), fix - joint.x[:2], noise)
+        assert np.abs(ours.mean - joint.x).max() < 1e-9, f"seed 21, step {step}"
+        assert np.abs(ours.cov - joint.P).max() < 1e-9, f"seed 21, step {step}"
+    mean, cov = ours.belief("t1")
+    assert np.allclose(mean, joint.x[6:])
+    assert np.allclose(cov, joint.P[6:, 6:])
+    assert np.allclose(ours.cross("r1", "t1"), joint.P[:3, 6:])
+
+
+@pytest.mark.parametrize("cap", [0.0, 4.0])
+def test_an_outlier_is_weakened_by_the_cap_alone(cap: float) -> None:
+    subject = CentralizedFilter(ROBOTS, TARGETS, LANDMARKS, "unscented", cap)
+    before = subject.belief("r1")[0]
+    subject.fix("r1", "position", before[:2] + 30.0, np.diag([0.01, 0.01]))
+    moved = float(np.hypot(*(subject.belief("r1")[0] - before)[:2]))
+    assert (moved > 20.0) == (cap == 0.0)
+    np.linalg.cholesky(subject.cov)
