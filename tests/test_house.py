@@ -1,0 +1,89 @@
+"""The rules of the house that a machine can check: imports point down, the pure rooms have no I/O."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FLOORS = ("network", "agent", "sim", "deploy")
+IMPURE = {"asyncio", "socket", "threading", "time", "random", "os", "subprocess", "secrets", "zenoh", "select"}
+
+PURE = (
+    "network/messages.py",
+    "network/wire.py",
+    "network/endpoint.py",
+    "network/clock.py",
+    "network/peers.py",
+    "network/links.py",
+    "agent/core.py",
+    "agent/timeline.py",
+    "agent/history.py",
+    "agent/belief.py",
+    "agent/pairing.py",
+    "agent/pairs.py",
+    "agent/node.py",
+    "agent/events.py",
+    "agent/effects.py",
+    "agent/settings.py",
+    "agent/sensor_input.py",
+    "agent/autopilot.py",
+    "agent/frames.py",
+    *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "agent" / "estimation").glob("*.py"))),
+    "sim/world.py",
+    "sim/noise.py",
+    "sim/centralized.py",
+    "sim/metrics.py",
+)
+CONFIG_ONLY = ("agent/config.py", "agent/config_file.py", "agent/config_parts.py", "sim/scenario.py")
+
+
+def imports(path: Path) -> set[str]:
+    """Modules a file imports, wherever in it."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            found.add(node.module)
+    return found
+
+
+def modules() -> list[Path]:
+    return [path for floor in FLOORS for path in sorted((ROOT / floor).rglob("*.py"))]
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_point_down(path: Path) -> None:
+    floor = FLOORS.index(path.relative_to(ROOT).parts[0])
+    above = [name for name in imports(path) if name.split(".")[0] in FLOORS[floor + 1 :]]
+    assert above == []
+    if str(path.relative_to(ROOT)) not in CONFIG_ONLY:
+        assert not [name for name in imports(path) if name.split(".")[0] == "pydantic"]
+
+
+@pytest.mark.parametrize("name", PURE)
+def test_pure_rooms_have_no_io(name: str) -> None:
+    assert not {module.split(".")[0] for module in imports(ROOT / name)} & IMPURE
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_module_sits_in_a_circle(path: Path) -> None:
+    graph: dict[str, set[str]] = {}
+    for item in modules():
+        name = ".".join(item.relative_to(ROOT).with_suffix("").parts)
+        graph[name] = {module for module in imports(item) if module.split(".")[0] in FLOORS}
+    start = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    # What is imported only for type checking may point back.
+    if start in ("deploy.launch", "deploy.status"):
+        graph["deploy.status"] = graph["deploy.status"] - {"deploy.launch"}
+    seen: set[str] = set()
+    frontier = sorted(graph[start])
+    while frontier:
+        name = frontier.pop()
+        assert name != start, f"{start} imports itself in the end"
+        if name not in seen:
+            seen.add(name)
+            frontier += sorted(graph.get(name, set()))
