@@ -72,7 +72,7 @@ class AgentShell:
         self._sensor_transport: asyncio.BaseTransport | None = None
         self._receive: Any = None
         self._timer: asyncio.TimerHandle | None = None
-        self._timer_due_ns = self._timer_set_ns = 0
+        self._timer_due_ns = self._timer_set_ns = self._start_ns = 0
         self._published_s = 0.0
         self._lag_ns = 0
         self._stop = asyncio.Event()
@@ -184,6 +184,7 @@ class AgentShell:
     async def _begin(self) -> None:
         config = self.config
         start_ns = self._clock.t0_ns if config.clock.source == "run" else self._clock.now_ns()
+        self._start_ns = start_ns
         if config.recording is not None:
             self._recording = RecordingWriter(Path(config.recording))
             self._recording.add_robot(config, start_ns)
@@ -269,7 +270,8 @@ class AgentShell:
     def _arm(self) -> None:
         """Set the timer to the node's next deadline; never a busy loop."""
         assert self._node is not None
-        deadline = self._node.next_deadline_ns()
+        # A run's clock reaches its start some time after the barrier; nothing is said to peers before that.
+        deadline = max(self._node.next_deadline_ns(), self._start_ns)
         if self._timer is not None:
             if deadline == self._timer_due_ns:
                 return

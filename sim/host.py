@@ -116,8 +116,9 @@ class WorldHost:
 
     async def _play(self, clock: FleetClock, control: ControlLine) -> None:
         world = self._world
-        await self._until(clock, clock.t0_ns)
+        # Told before the start, so that the first packets are judged by it.
         self._publish_reach(0, clock.t0_ns)
+        await self._until(clock, clock.t0_ns)
         for robot, server in self._servers.items():
             server.stand_in.set_odometry(clock.t0_ns, np.zeros(4))
             self._place(robot, 0, clock.t0_ns)
