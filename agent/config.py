@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -31,8 +32,11 @@ from agent.config_parts import (
     SigmaPart,
     TrackingPart,
 )
+from agent.mavlink import MavlinkEndpointError, parse_endpoint
 from agent.sensor_input import SensorConfig
 from agent.settings import AgentSettings, nanoseconds
+
+_LOOPBACK = re.compile(r"\w+/(127\.\d+\.\d+\.\d+|localhost|\[::1\]):\d+(\?.*)?\Z")
 
 
 class IdentityPart(Part):
@@ -71,11 +75,15 @@ class PeerPart(Part):
 
 
 class ZenohPart(Part):
-    """Zenoh endpoints: what this robot listens on, and where its peers do (lower ids are dialled)."""
+    """Zenoh endpoints: what this robot listens on, and where its peers do (lower ids are dialled).
+
+    Links are neither encrypted nor authenticated: beyond loopback only with `insecure_lan`.
+    """
 
     listen: list[str]
     peers: list[PeerPart] = []
     lease_ms: Annotated[int, Field(ge=100)] = 1000
+    insecure_lan: bool = False
 
 
 class MavlinkPart(Part):
@@ -91,6 +99,10 @@ class MavlinkPart(Part):
     odometry_source: Literal["odometry", "velocity", "none"] = "odometry"
     odometry: OdometryPart = OdometryPart()
     rate_hz: Positive = 10.0
+    system_id: Annotated[int, Field(ge=1, le=255)] | None = None
+    position_source: Literal["global", "local"] = "global"
+    max_speed_mps: Positive = 30.0
+    max_distance_m: Positive = 100_000.0
 
     def settings(self, origin: list[float]) -> AutopilotSettings:
         return AutopilotSettings(
@@ -103,6 +115,10 @@ class MavlinkPart(Part):
             odometry_source=self.odometry_source,
             odometry_noise=self.odometry.noise(),
             message_interval_ns=nanoseconds(1.0 / self.rate_hz),
+            system_id=self.system_id,
+            position_source=self.position_source,
+            max_speed_mps=self.max_speed_mps,
+            max_distance_m=self.max_distance_m,
         )
 
 
@@ -180,10 +196,21 @@ def load_agent_config(path: Path) -> AgentConfig:
         twice = next((item for item in ids if ids.count(item) > 1), None)
         if twice is not None:
             raise ConfigError(f"{path}: {name} id '{twice}' is used twice; ids must differ")
-    simulated = config.mavlink is None or config.mavlink.simulated
+    try:
+        simulated = config.mavlink is None or (
+            config.mavlink.simulated and parse_endpoint(config.mavlink.endpoint).is_loopback
+        )
+    except MavlinkEndpointError as error:
+        raise ConfigError(f"{path}: mavlink.endpoint: {error}") from None
+    exposed = next((item for item in config.zenoh.listen if not _LOOPBACK.match(item)), None)
+    if exposed is not None and not config.zenoh.insecure_lan:
+        raise ConfigError(
+            f"{path}: zenoh.listen '{exposed}' is open to the network without encryption or authentication; "
+            "listen on 127.0.0.1, or set zenoh.insecure_lan = true if you trust everybody on it"
+        )
     if not simulated and config.clock.source != "system":
         raise ConfigError(
-            f"{path}: clock.source = 'run' needs mavlink.simulated = true: a real autopilot keeps real time"
+            f"{path}: clock.source = 'run' needs mavlink.simulated = true on loopback: a real autopilot keeps real time"
         )
     if not simulated and config.injection is not None:
         raise ConfigError(f"{path}: [injection] is refused with a real autopilot; remove it")

@@ -222,25 +222,27 @@ class Agent:
     def _absolute(
         self, t_ns: int, kind: str, model: AbsoluteModel | RelativeModel, event: Fix | Observation
     ) -> None:
-        then, present = self.state, None
-        if self._late(t_ns):
-            found = None if self.settings.lateness.kind == "discard" else self.history.at(t_ns)
-            if found is None:
-                self.counters["late.dropped"] += 1
-                return
-            self.counters["late.compensated"] += 1
-            then = found[0]
-            present = (self.state.mean, self.state.cov, found[1])
-        update = absolute_update(
-            then.mean, then.cov, self.settings.layout, model, event.z, event.R, self._options, present
-        )
-        if update is None:
+        late = self._late(t_ns)
+        then: RobotState | None = self.state
+        if late:
+            then = None if self.settings.lateness.kind == "discard" else self.history.cut(t_ns)
+        if then is None:
+            self.counters["late.dropped"] += 1
+            return
+        update = absolute_update(then.mean, then.cov, self.settings.layout, model, event.z, event.R, self._options)
+        state: RobotState | None = None
+        if update is not None and late:
+            state = self.history.corrected(then.t_ns, update)
+        elif update is not None:
+            state = self.state.updated(update.mean, update.cov, update.left)
+            self.history.updated(state, update.left)
+        if update is None or state is None:
             self.counters["update.not_positive_definite"] += 1
             return
+        self.state = state
+        self.counters["late.compensated"] += late
         self.counters[f"used.{kind}"] += 1
         self._count_nis(kind, update.nis)
-        self.state = self.state.updated(update.mean, update.cov, update.left)
-        self.history.updated(self.state, update.left)
 
     def _landmark(self, t_ns: int, event: Observation) -> None:
         assert event.of is not None

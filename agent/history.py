@@ -3,19 +3,27 @@
 An entry is made whenever the state's instant advances, and holds the last state at that instant. Since the
 own error obeys e_now = Psi e_k + (noise since k), Psi is the product of left factors after k: of each
 entry's prediction F and of all updates applied while it was the newest.
+
+Own data that come late are used at the instant they belong to, and all later states follow: with the gain K at k
+every later error becomes e_l - Psi_kl K nu. Any number of them may overlap, since each finds the past as the ones
+before have left it. (A gain applied to the newest state alone, Psi K, is exact for one measurement under way and
+unstable for many: each of them corrects the same error of the past again.)
 """
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.belief import RobotState, TargetState
+from agent.belief import CorrelationStack, Part, RobotState, TargetState
+from agent.estimation.colocalization import Update
+from agent.estimation.gaussian import gain, is_positive_definite, symmetrize, wrap_components
 from agent.estimation.motion import advance, split_increment
 from agent.settings import AgentSettings
+from network.messages import Epoch
 
 Array = NDArray[np.float64]
 
@@ -72,7 +80,10 @@ class History:
         """The newest state has moved to a later instant."""
         self._entries.append(Entry(state, delta, delta_cov, F, np.eye(len(state.mean))))
         self._stamps.append(state.t_ns)
-        oldest = state.t_ns - self._settings.lateness.horizon_ns
+        self._trim()
+
+    def _trim(self) -> None:
+        oldest = self._stamps[-1] - self._settings.lateness.horizon_ns
         surplus = 0
         while surplus < len(self._stamps) - 1 and (
             self._stamps[surplus + 1] <= oldest or len(self._stamps) - surplus > MAX_ENTRIES
@@ -111,7 +122,88 @@ class History:
         rest = advance(state.mean, state.cov, second, second_cov, localization.transform, localization.parameters)
         return state, self._since(index + 2, following.after @ rest.F)
 
+    def cut(self, t_ns: int) -> RobotState | None:
+        """The state at a past instant `t_ns`, as an entry of its own from now on; None outside the ring."""
+        tolerance = self._settings.lateness.tolerance_ns
+        index = bisect_right(self._stamps, t_ns + tolerance) - 1
+        if index < 0 or t_ns > self._stamps[-1] + tolerance:
+            return None
+        entry = self._entries[index]
+        if t_ns - self._stamps[index] <= tolerance or index + 1 == len(self._entries):
+            return entry.state
+        following = self._entries[index + 1]
+        share = (t_ns - self._stamps[index]) / (self._stamps[index + 1] - self._stamps[index])
+        first, first_cov, second, second_cov = split_increment(following.delta, following.delta_cov, share)
+        state, F = moved(self._settings, entry.state, t_ns, first, first_cov)
+        localization = self._settings.localization
+        rest = advance(state.mean, state.cov, second, second_cov, localization.transform, localization.parameters)
+        following.delta, following.delta_cov, following.F = second, second_cov, rest.F
+        self._entries.insert(index + 1, Entry(state, first, first_cov, F, np.eye(len(state.mean))))
+        self._stamps.insert(index + 1, t_ns)
+        self._trim()
+        return state
+
+    def corrected(self, t_ns: int, update: Update) -> RobotState | None:
+        """Use late own information: `update` of the state at `t_ns`, which is an entry's instant (see `cut`).
+
+        That state and all later ones are corrected, P_l -= Psi (P_k - P_k+) Psi^T, as are the correlations, and the
+        newest is returned. This is the in-order result of a linear model if no other update lies in between; otherwise
+        the gains in between are no longer the best ones, and the covariances are those of the errors with these gains.
+        None, and no change, if a covariance would not stay positive definite.
+        """
+        first = bisect_left(self._stamps, t_ns)
+        before = self._entries[first].state
+        angles = self._settings.layout.angles
+        shift = wrap_components(update.mean - before.mean, angles)
+        lost = before.cov - update.cov
+        correction = _StackCorrection(before, update.left)
+        psi = np.eye(len(before.mean))
+        states = [replace(before, mean=update.mean, cov=update.cov, stack=correction.stack(before, psi))]
+        for entry in self._entries[first + 1 :]:
+            psi = entry.after @ (entry.F @ psi)
+            state = entry.state
+            mean = wrap_components(state.mean + psi @ shift, angles)
+            cov = symmetrize(state.cov - psi @ lost @ psi.T)
+            if not is_positive_definite(cov):
+                return None
+            states.append(replace(state, mean=mean, cov=cov, stack=correction.stack(state, psi)))
+        for entry, state in zip(self._entries[first:], states):
+            entry.state = state
+        self._entries[first].after = update.left @ self._entries[first].after
+        return states[-1]
+
     def _since(self, index: int, psi: Array) -> Array:
         for entry in self._entries[index:]:
             psi = entry.after @ (entry.F @ psi)
         return psi
+
+
+class _StackCorrection:
+    """What late information at k does to the correlations: X_l -= Psi_kl B X_k, B = 1 - P_k+ P_k^-1 = K H.
+
+    A block that is younger than k, first found at p, is taken back by the smoother: X_k = P_k Psi_kp^T P_p^-1 X_p.
+    """
+
+    def __init__(self, before: RobotState, left: Array) -> None:
+        self._cov = before.cov
+        self._B = np.eye(len(left)) - left
+        self._sources: dict[tuple[Part, str, Epoch], Array] = {}
+        self._last: tuple[RobotState, Array] | None = None
+
+    def stack(self, state: RobotState, psi: Array) -> CorrelationStack:
+        """The stack of a `state`, not corrected yet, that the error at k is mapped to by `psi`."""
+        if not state.stack.blocks:
+            return state.stack
+        if self._last is None or (
+            self._last[0].stack.blocks is not state.stack.blocks or self._last[0].pairs is not state.pairs
+        ):
+            back = self._B @ gain(self._cov @ psi.T, state.cov)
+            parts = []
+            for (part, peer, epoch), (a, b) in state.stack.blocks.items():
+                # A factor and its line stand for the pair's base contact, whichever that is.
+                name = (part, peer, epoch if part is Part.LINE else state.pair(peer).base)
+                if name not in self._sources:
+                    self._sources[name] = back @ state.stack.matrix[:, a:b]
+                parts.append(self._sources[name])
+            self._last = (state, np.concatenate(parts, axis=1))
+        return CorrelationStack(state.stack.matrix - psi @ self._last[1], state.stack.blocks)

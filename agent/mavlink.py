@@ -51,6 +51,11 @@ class Endpoint:
     place: str
     number: int
 
+    @property
+    def is_loopback(self) -> bool:
+        """Whether the other end can only be on this computer."""
+        return self.kind != "serial" and (self.place in ("localhost", "::1") or self.place.startswith("127."))
+
 
 def parse_endpoint(text: str) -> Endpoint:
     """Raises `MavlinkEndpointError` (a ValueError) that names the text and the valid forms."""

@@ -110,6 +110,8 @@ class AgentShell:
             self._incarnation = counted or next_incarnation(self._state_dir, time.time_ns())
         except OSError as error:
             raise ConfigError(f"state_dir {self._state_dir} cannot be written: {error.strerror}") from None
+        if config.zenoh.insecure_lan:
+            log.warning("zenoh.insecure_lan: messages to peers are neither encrypted nor authenticated")
         self._boot_id = secrets.randbits(53)
         settings = ZenohSettings(
             fleet=config.identity.fleet,

@@ -66,20 +66,16 @@ def absolute_update(
     z: Array,
     R: Array,
     options: Options,
-    present: tuple[Array, Array, Array] | None = None,
 ) -> Update | None:
     """Use absolute information, or a known landmark (UT-CLAT 3.2.1).
 
-    (mean, cov) is the belief at the instant of the measurement. For a delayed one `present` is the belief now
-    and Psi, the left factor since then: K = Psi C S^-1 (Larsen et al. 1998, exact for one such measurement,
-    consistent for any number). None when the posterior would not be positive definite.
+    (mean, cov) is the belief at the instant of the measurement. None when the posterior would not be positive
+    definite.
     """
     predicted = observe(model.h, model.jacobian, mean, cov, model.angles, options.transform, options.parameters)
     innovation = _innovation(predicted, z, model.angles)
     S, nis = _capped(innovation, predicted.cov + R, options.innovation_cap)
-    now_mean, now_cov, psi = present if present is not None else (mean, cov, None)
-    cross = predicted.cross if psi is None else psi @ predicted.cross
-    return _applied(now_mean, now_cov, layout, gain(cross, S), S, innovation, nis)
+    return _applied(mean, cov, layout, gain(predicted.cross, S), S, innovation, nis)
 
 
 def _applied(

@@ -174,3 +174,24 @@ def test_a_file_that_is_not_there_or_not_toml(tmp_path: Path) -> None:
 
 def test_a_message_is_always_one_line() -> None:
     assert str(ConfigError("a\n  b\r\nc")) == "a b c"
+
+
+def test_open_links_must_be_asked_for_by_name(tmp_path: Path) -> None:
+    """Without encryption a robot listens on loopback alone, unless told that the network is trusted."""
+    open_link = {"listen": ["udp/0.0.0.0:20001?rel=0"], "peers": []}
+    assert "zenoh.insecure_lan" in complaint(tmp_path, example(zenoh=open_link))
+    trusted = load_agent_config(write(tmp_path, example(zenoh=open_link | {"insecure_lan": True})))
+    assert trusted.zenoh.insecure_lan
+
+
+@pytest.mark.parametrize("endpoint", ["udpin:192.168.1.4:14550", "tcp:10.0.0.2:5760", "serial:/dev/ttyS0:57600"])
+def test_an_autopilot_beyond_loopback_counts_as_real(tmp_path: Path, endpoint: str) -> None:
+    """Whatever it is declared to be: nothing is injected, and time is real."""
+    mavlink = {"endpoint": endpoint, "simulated": True}
+    assert "[injection]" in complaint(tmp_path, example(mavlink=mavlink, injection={"seed": 1}))
+    assert "clock.source" in complaint(tmp_path, example(mavlink=mavlink, clock={"source": "run"}))
+    assert load_agent_config(write(tmp_path, example(mavlink=mavlink))).mavlink is not None
+
+
+def test_a_wrong_mavlink_endpoint_is_told_before_anything_starts(tmp_path: Path) -> None:
+    assert "mavlink.endpoint" in complaint(tmp_path, example(mavlink={"endpoint": "udp:14550"}))
