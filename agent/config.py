@@ -198,7 +198,7 @@ def load_agent_config(path: Path) -> AgentConfig:
             raise ConfigError(f"{path}: {name} id '{twice}' is used twice; ids must differ")
     try:
         simulated = config.mavlink is None or (
-            config.mavlink.simulated and parse_endpoint(config.mavlink.endpoint).is_loopback
+            parse_endpoint(config.mavlink.endpoint).is_loopback and config.mavlink.simulated
         )
     except MavlinkEndpointError as error:
         raise ConfigError(f"{path}: mavlink.endpoint: {error}") from None
