@@ -146,10 +146,10 @@ MISTAKES: list[tuple[dict[str, Any], list[str]]] = [
     ({"targets": [TARGET, TARGET]}, ["'t1' is used twice"]),
     ({"landmarks": [{"id": "L", "position": [0.0, 0.0]}] * 2}, ["'L' is used twice"]),
     (
-        {"mavlink": {"endpoint": "x"}, "clock": {"source": "run"}},
+        {"mavlink": {"endpoint": "udpin:127.0.0.1:14550"}, "clock": {"source": "run"}},
         ["clock.source", "mavlink.simulated = true"],
     ),
-    ({"mavlink": {"endpoint": "x"}, "injection": {"seed": 1}}, ["[injection]", "remove it"]),
+    ({"mavlink": {"endpoint": "udpin:127.0.0.1:14550"}, "injection": {"seed": 1}}, ["[injection]", "remove it"]),
 ]
 
 
