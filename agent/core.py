@@ -240,7 +240,8 @@ class Agent:
             self.counters["update.not_positive_definite"] += 1
             return
         self.state = state
-        self.counters["late.compensated"] += late
+        if late:
+            self.counters["late.compensated"] += 1
         self.counters[f"used.{kind}"] += 1
         self._count_nis(kind, update.nis)
 
