@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import csv
 import multiprocessing
+import os
+import signal
+import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -21,6 +25,18 @@ def _one(task: tuple[Scenario, int, bool]) -> dict[str, Any]:
     return reduce(scenario, run_trial(scenario, seed, with_bound=with_bound))
 
 
+def _follow(parent: int) -> None:
+    """In a worker: leave interrupts to the parent, and end when it is gone, however it went."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def run_trials(
     scenario: Scenario, trials: int, jobs: int, seed: int, with_bound: bool, progress: Progress | None = None
 ) -> list[dict[str, Any]]:
@@ -34,7 +50,9 @@ def run_trials(
                 progress(len(results), trials)
         return results
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, trials), mp_context=context) as pool:
+    with ProcessPoolExecutor(
+        min(jobs, trials), mp_context=context, initializer=_follow, initargs=(os.getpid(),)
+    ) as pool:
         futures = [pool.submit(_one, task) for task in tasks]
         try:
             for future in futures:
@@ -42,7 +60,9 @@ def run_trials(
                 if progress is not None:
                     progress(len(results), trials)
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            # Half-done trials are of no use to anybody; without this the pool would wait for them.
+            for worker in multiprocessing.active_children():
+                worker.terminate()
             raise
     return results
 
