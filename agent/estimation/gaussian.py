@@ -8,11 +8,15 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 TWO_PI = 2.0 * np.pi
+LOWEST = -float(np.nextafter(np.pi, 0.0))
+"""The smallest wrapped angle: -pi itself is the same direction as pi."""
 
 
 def wrap(angle: Array) -> Array:
     """Angles [rad] mapped to (-pi, pi]; any shape."""
-    return np.pi - np.remainder(np.pi - angle, TWO_PI)
+    # The remainder of a tiny negative number rounds to a whole turn.
+    wrapped: Array = np.maximum(np.pi - np.remainder(np.pi - angle, TWO_PI), LOWEST)
+    return wrapped
 
 
 def wrap_components(vector: Array, angles: tuple[int, ...]) -> Array:

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.gaussian import wrap
+
 Array = NDArray[np.float64]
 
 RELATIVE_ANGLES: dict[str, tuple[int, ...]] = {"range": (), "bearing": (0,), "range_bearing": (1,)}
@@ -88,8 +90,7 @@ class RelativeModel:
         distance = np.hypot(d[..., 0], d[..., 1])
         if self.kind == "range":
             return np.asarray(distance[..., None])
-        bearing = np.arctan2(d[..., 1], d[..., 0]) - state[..., 2] - self.mount[2]
-        bearing = np.pi - np.remainder(np.pi - bearing, 2.0 * np.pi)
+        bearing = wrap(np.arctan2(d[..., 1], d[..., 0]) - state[..., 2] - self.mount[2])
         if self.kind == "bearing":
             return np.asarray(bearing[..., None])
         return np.stack([distance, bearing], axis=-1)
