@@ -6,6 +6,7 @@ Planar states are x, y, heading (unicycle) or x, y, vx, vy; ENU, heading counter
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -143,13 +144,20 @@ def velocity_step(layout: StateLayout, dt: float, damping_s: float) -> tuple[Arr
         q_pp, q_pv, q_vv = dt**3 / 3.0, dt**2 / 2.0, dt
     else:
         rate = 1.0 / damping_s
-        velocity = float(np.exp(-rate * dt))
-        position = (1.0 - velocity) / rate
-        q_vv = (1.0 - velocity**2) / (2.0 * rate)
-        q_pv = (1.0 - velocity) ** 2 / (2.0 * rate**2)
-        q_pp = (dt - 2.0 * (1.0 - velocity) / rate + (1.0 - velocity**2) / (2.0 * rate)) / rate**2
+        decay = -math.expm1(-rate * dt)
+        position, velocity = decay / rate, 1.0 - decay
+        q_vv = -math.expm1(-2.0 * rate * dt) / (2.0 * rate)
+        q_pv = decay**2 / (2.0 * rate**2)
+        q_pp = dt**3 * _damped_position_variance(rate * dt)
     for axis in (0, 1):
         F[axis, axis + 2], F[axis + 2, axis + 2] = position, velocity
         Q[axis, axis], Q[axis + 2, axis + 2] = q_pp, q_vv
         Q[axis, axis + 2] = Q[axis + 2, axis] = q_pv
     return F, Q
+
+
+def _damped_position_variance(x: float) -> float:
+    """(x - 2 (1 - e^-x) + (1 - e^-2x) / 2) / x^3; by its series where the closed form cancels."""
+    if x < 0.5:
+        return sum((-x) ** (k - 3) * (2.0 ** (k - 1) - 2.0) / math.factorial(k) for k in range(3, 19))
+    return (x + 2.0 * math.expm1(-x) - 0.5 * math.expm1(-2.0 * x)) / x**3
