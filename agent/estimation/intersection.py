@@ -30,17 +30,20 @@ def fuse(
     """Intersection of (n,), (n, n) beliefs: P^-1 = w P_a^-1 + (1-w) P_b^-1 (UT-CLAT eq. 29).
 
     `fast` takes w from the traces (Niehsen 2002); `trace` and `logdet` search a grid including both ends,
-    so the result is never worse than the better belief. Returns (mean, cov, w).
+    so the result is never worse than the better belief; among equal weights the one nearest 1/2 is taken.
+    Returns (mean, cov, w).
     """
     info_a, info_b = np.linalg.inv(cov_a), np.linalg.inv(cov_b)
     if weight == "fast":
         trace_a, trace_b = float(np.trace(cov_a)), float(np.trace(cov_b))
         best = trace_b / (trace_a + trace_b)
     else:
-        grid = np.concatenate([[0.0], GRID, [1.0]])[:, None, None]
-        best = float(
-            grid[int(np.argmin(cost(np.linalg.inv(grid * info_a + (1.0 - grid) * info_b), weight))), 0, 0]
-        )
+        grid = np.concatenate([[0.0], GRID, [1.0]])
+        candidates = grid[:, None, None] * info_a + (1.0 - grid[:, None, None]) * info_b
+        costs = cost(np.linalg.inv(candidates), weight)
+        # Equal covariances leave the weight free: rounding must not choose, and either side must choose alike.
+        equal = np.isclose(costs, costs.min(), rtol=1e-9, atol=1e-9 if weight == "logdet" else 0.0)
+        best = float(grid[equal][np.argmin(np.abs(grid[equal] - 0.5))])
     cov = symmetrize(np.linalg.inv(best * info_a + (1.0 - best) * info_b))
     difference = wrap_components(mean_b - mean_a, angles)
     mean = mean_a + cov @ ((1.0 - best) * info_b @ difference)
