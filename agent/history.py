@@ -4,10 +4,10 @@ An entry is made whenever the state's instant advances, and holds the last state
 own error obeys e_now = Psi e_k + (noise since k), Psi is the product of left factors after k: of each
 entry's prediction F and of all updates applied while it was the newest.
 
-Own data that come late are used at the instant they belong to, and all later states follow: with the gain K at k
-every later error becomes e_l - Psi_kl K nu. Any number of them may overlap, since each finds the past as the ones
-before have left it. (A gain applied to the newest state alone, Psi K, is exact for one measurement under way and
-unstable for many: each of them corrects the same error of the past again.)
+Own data that come late, and contacts that are completed late, are used at the instant they belong to, and all later
+states follow: with the gain K at k every later error becomes e_l - Psi_kl K nu. Any number of them may overlap, since
+each finds the past as the ones before have left it. (A gain applied to the newest state alone, Psi K, is exact for one
+measurement under way and unstable for many: each of them corrects the same error of the past again.)
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.belief import CorrelationStack, Part, RobotState, TargetState
+from agent.belief import BlockKey, CorrelationStack, Part, RobotState, TargetState
 from agent.estimation.colocalization import Update
 from agent.estimation.gaussian import gain, is_positive_definite, symmetrize, wrap_components
 from agent.estimation.motion import advance, split_increment
@@ -99,31 +99,11 @@ class History:
         if left is not None:
             entry.after = left @ entry.after
 
-    def at(self, t_ns: int) -> tuple[RobotState, Array] | None:
-        """(state at `t_ns`, Psi (n, n) from then to now); None outside the ring.
+    def cut(self, t_ns: int) -> RobotState | None:
+        """The state at a past instant `t_ns`, as an entry of its own from now on; None outside the ring.
 
         Between two entries the increment that led to the later one is cut at `t_ns`.
         """
-        tolerance = self._settings.lateness.tolerance_ns
-        index = bisect_right(self._stamps, t_ns + tolerance) - 1
-        if index < 0 or t_ns > self._stamps[-1] + tolerance:
-            return None
-        entry = self._entries[index]
-        psi = np.eye(len(entry.state.mean))
-        if t_ns - self._stamps[index] <= tolerance or index + 1 == len(self._entries):
-            return entry.state, self._since(index + 1, psi)
-        following = self._entries[index + 1]
-        span = self._stamps[index + 1] - self._stamps[index]
-        first, first_cov, second, second_cov = split_increment(
-            following.delta, following.delta_cov, (t_ns - self._stamps[index]) / span
-        )
-        state, _ = moved(self._settings, entry.state, t_ns, first, first_cov)
-        localization = self._settings.localization
-        rest = advance(state.mean, state.cov, second, second_cov, localization.transform, localization.parameters)
-        return state, self._since(index + 2, following.after @ rest.F)
-
-    def cut(self, t_ns: int) -> RobotState | None:
-        """The state at a past instant `t_ns`, as an entry of its own from now on; None outside the ring."""
         tolerance = self._settings.lateness.tolerance_ns
         index = bisect_right(self._stamps, t_ns + tolerance) - 1
         if index < 0 or t_ns > self._stamps[-1] + tolerance:
@@ -143,39 +123,69 @@ class History:
         self._trim()
         return state
 
-    def corrected(self, t_ns: int, update: Update) -> RobotState | None:
-        """Use late own information: `update` of the state at `t_ns`, which is an entry's instant (see `cut`).
+    def opened(self, t_ns: int, peer: str, epoch: Epoch) -> RobotState:
+        """Open a contact's identity line at `t_ns`, an entry's instant, in all states since; returns the newest."""
+        first = bisect_left(self._stamps, t_ns)
+        psi = np.eye(len(self._entries[first].state.mean))
+        for index, entry in enumerate(self._entries[first:]):
+            if index:
+                psi = entry.after @ (entry.F @ psi)
+            entry.state = entry.state.with_line(peer, epoch, psi, self._settings.localization.max_lines)
+        return self._entries[-1].state
+
+    def first_with(self, key: BlockKey) -> RobotState | None:
+        """The earliest of the newest states that have a block of correlation; None if the newest has none."""
+        found = None
+        for entry in reversed(self._entries):
+            if key not in entry.state.stack.blocks:
+                break
+            found = entry.state
+        return found
+
+    def corrected(
+        self, t_ns: int, update: Update, base: tuple[str, Epoch, Array] | None = None
+    ) -> RobotState | None:
+        """Use late information: `update` of the state at `t_ns`, which is an entry's instant (see `cut`).
 
         That state and all later ones are corrected, P_l -= Psi (P_k - P_k+) Psi^T, as are the correlations, and the
         newest is returned. This is the in-order result of a linear model if no other update lies in between; otherwise
         the gains in between are no longer the best ones, and the covariances are those of the errors with these gains.
-        None, and no change, if a covariance would not stay positive definite.
+        A contact that is applied besides becomes its pair's `base`: (peer, epoch, P_ij after it); its line is what was
+        kept for it so far, without the update. None, and no change, if a covariance would not stay positive definite.
         """
         first = bisect_left(self._stamps, t_ns)
         before = self._entries[first].state
         angles = self._settings.layout.angles
         shift = wrap_components(update.mean - before.mean, angles)
         lost = before.cov - update.cov
-        correction = _StackCorrection(before, update.left)
+        states = [_based(before, before.updated(update.mean, update.cov, update.left), base)]
+        later = self._entries[first + 1 :]
+        correction = _StackCorrection(before, update.left) if later else None
         psi = np.eye(len(before.mean))
-        states = [replace(before, mean=update.mean, cov=update.cov, stack=correction.stack(before, psi))]
-        for entry in self._entries[first + 1 :]:
+        for entry in later:
             psi = entry.after @ (entry.F @ psi)
             state = entry.state
             mean = wrap_components(state.mean + psi @ shift, angles)
             cov = symmetrize(state.cov - psi @ lost @ psi.T)
             if not is_positive_definite(cov):
                 return None
-            states.append(replace(state, mean=mean, cov=cov, stack=correction.stack(state, psi)))
+            assert correction is not None
+            corrected = replace(state, mean=mean, cov=cov, stack=correction.stack(state, psi))
+            states.append(_based(state, corrected, base))
         for entry, state in zip(self._entries[first:], states):
             entry.state = state
         self._entries[first].after = update.left @ self._entries[first].after
         return states[-1]
 
-    def _since(self, index: int, psi: Array) -> Array:
-        for entry in self._entries[index:]:
-            psi = entry.after @ (entry.F @ psi)
-        return psi
+
+def _based(before: RobotState, after: RobotState, base: tuple[str, Epoch, Array] | None) -> RobotState:
+    """The state `after` a contact with the contact as its pair's base, its line from `before`."""
+    if base is None:
+        return after
+    peer, epoch, cross = base
+    line = before.stack.block((Part.LINE, peer, epoch))
+    assert line is not None
+    return after.with_base(peer, epoch, line @ cross, line)
 
 
 class _StackCorrection:
@@ -189,6 +199,7 @@ class _StackCorrection:
         self._B = np.eye(len(left)) - left
         self._sources: dict[tuple[Part, str, Epoch], Array] = {}
         self._last: tuple[RobotState, Array] | None = None
+        self.stack(before, np.eye(len(left)))
 
     def stack(self, state: RobotState, psi: Array) -> CorrelationStack:
         """The stack of a `state`, not corrected yet, that the error at k is mapped to by `psi`."""

@@ -146,17 +146,14 @@ class Pairs:
         if step is not Step.OPEN:
             self._counters[f"pair.{step.value}"] += 1
             return state, None
-        found = history.at(t_ns)
-        if found is None:
+        then = history.cut(t_ns)
+        if then is None:
             self._counters["pair.too_old_own"] += 1
             return state, None
-        then, psi = found
         told = tuple(self._with_clock_noise(peer, item) for item in measurements[:MAX_MEASUREMENTS])
         request = exchange.open(t_ns, now_ns, told, self._fitting(self.snapshot(then, peer), told))
         self._counters["pair.started"] += 1
-        state = state.with_line(peer, request.epoch, psi, self._settings.localization.max_lines)
-        history.updated(state)
-        return state, request
+        return history.opened(then.t_ns, peer, request.epoch), request
 
     def request(
         self, event: Received, t_ns: int, state: RobotState, history: History, effects: list[Effect]
@@ -179,16 +176,14 @@ class Pairs:
         if refusal is not None:
             effects.append(Send(peer, epoch.t_meas_ns, PairReply(epoch, refusal)))
             return state
-        found = history.at(t_ns)
-        if found is None:
+        then = history.cut(t_ns)
+        if then is None:
             self._counters["pair.too_old"] += 1
             effects.append(Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.TOO_OLD))))
             return state
-        then, psi = found
         own = self._fitting(self.snapshot(then, peer), ())
         effects.append(Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.OK, own))))
-        state = state.with_line(peer, epoch, psi, self._settings.localization.max_lines)
-        history.updated(state)
+        state = history.opened(then.t_ns, peer, epoch)
         return self._apply(peer, epoch, request.snapshot, own, request.measurements, False, t_ns, state, history)
 
     def reply(self, peer: str, reply: PairReply, state: RobotState, history: History) -> RobotState:
@@ -311,8 +306,10 @@ class Pairs:
         except np.linalg.LinAlgError:
             self._counters["pair.indefinite"] += 1
             return state
-        psi = state.stack.block((Part.LINE, peer, epoch))
-        if psi is None:
+        key = (Part.LINE, peer, epoch)
+        then = history.first_with(key)
+        psi = None if then is None else then.stack.block(key)
+        if then is None or psi is None:
             self._counters["pair.line_lost"] += 1
             return state
         if found.cross is None:
@@ -321,16 +318,15 @@ class Pairs:
             history.updated(state)
             return state
         C_own = found.C_i if own_initiated else found.C_j
-        update = pair_update(state.mean, state.cov, self._settings.layout, psi, C_own, found)
-        if update is None:
+        update = pair_update(then.mean, then.cov, self._settings.layout, psi, C_own, found)
+        after = found.cross_after if own_initiated else found.cross_after.T
+        base = (peer, epoch, after if correlated else np.zeros_like(after))
+        corrected = None if update is None else history.corrected(then.t_ns, update, base)
+        if update is None or corrected is None:
             self._counters["update.not_positive_definite"] += 1
             return state
-        state = state.updated(update.mean, update.cov, update.left)
-        after = found.cross_after if own_initiated else found.cross_after.T
-        factor = psi @ after if correlated else np.zeros_like(after)
-        state = state.with_base(peer, epoch, factor, psi)
-        state = self._fuse_targets(other, t_ns, state, correlated)
-        history.updated(state, update.left)
+        state = self._fuse_targets(other, t_ns, corrected, correlated)
+        history.updated(state)
         self._count_nis("pair_" + "+".join(item.kind for item in measurements), update.nis)
         self._counters["pair.applied_initiator" if own_initiated else "pair.applied_responder"] += 1
         return state

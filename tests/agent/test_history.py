@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,13 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agent.belief import CorrelationStack, RobotState
+from agent.belief import CorrelationStack, Part, RobotState
 from agent.core import Agent
 from agent.estimation.colocalization import Update
 from agent.estimation.motion import compose
 from agent.events import Event, Fix, Observation, Odometry, Tick
 from agent.history import MAX_ENTRIES, History, moved
 from agent.settings import NS, AgentSettings, LatenessSettings, LocalizationSettings
+from network.messages import Epoch
 from tests.agent.courier import FIRST, SECOND, TINY, Pair
 
 Array = NDArray[np.float64]
@@ -190,9 +190,7 @@ def test_data_older_than_a_contact_move_its_line_as_the_own_error() -> None:
     before = pair.agents[FIRST].state.cov
     pair.odometry(FIRST, 3 * NS, 4 * NS, np.array([0.3, 0.1, 0.0, 0.0]), NOISE)
     pair.agents[FIRST].handle(fix(NS, pair.now_ns))
-    found = pair.agents[FIRST].history.at(3 * NS)
-    assert found is not None
-    then, psi = found
+    then, psi = since(pair.agents[FIRST].history, 3 * NS)
     (line,) = pair.agents[FIRST].snapshot(SECOND).lines
     assert line.epoch == request.body.epoch
     assert np.abs(line.matrix - psi @ then.cov @ np.linalg.inv(before)).max() < 1e-6
@@ -206,10 +204,18 @@ def test_a_correction_that_would_leave_a_covariance_indefinite_changes_nothing()
     state = subject.state
     impossible = Update(then.mean, -3.0 * then.cov, np.eye(3), 1.0)
     assert subject.history.corrected(then.t_ns, impossible) is None
-    found = subject.history.at(2 * STEP)
-    assert found is not None
-    assert found[0] is then
+    assert subject.history.cut(2 * STEP) is then
     assert subject.state is state
+
+
+def since(history: History, t_ns: int) -> tuple[RobotState, Array]:
+    """The state at `t_ns`, and the left factors of its error since, as a contact's identity line has them."""
+    then = history.cut(t_ns)
+    assert then is not None
+    probe = Epoch(t_ns, "probe", 1)
+    psi = history.opened(then.t_ns, "probe", probe).stack.block((Part.LINE, "probe", probe))
+    assert psi is not None
+    return then, psi
 
 
 def filled(count: int, horizon_ns: int = 60 * NS) -> tuple[History, RobotState]:
@@ -228,43 +234,39 @@ def test_the_past_is_told_with_the_factors_since() -> None:
     base = plain(np.diag([0.3, 0.2, 0.05]))
     subject = played(Agent(base), [drive(0), fix(STEP, STEP), drive(1), fix(2 * STEP, 2 * STEP), drive(2)])
     for t_ns in (0, STEP // 2, STEP, 3 * STEP // 2, 2 * STEP, 3 * STEP):
-        found = subject.history.at(t_ns)
-        assert found is not None
-        then, psi = found
+        then, psi = since(subject.history, t_ns)
         assert then.t_ns == t_ns
         # What is left of P is noise since then: P - Psi P_k Psi^T >= 0, and zero at the present.
         assert np.linalg.eigvalsh(subject.state.cov - psi @ then.cov @ psi.T).min() > -1e-12
-    assert subject.history.at(-1) is None
-    assert subject.history.at(3 * STEP + 1) is None
+    assert np.array_equal(psi, np.eye(3))
+    assert subject.history.cut(-1) is None
+    assert subject.history.cut(3 * STEP + 1) is None
 
 
 def test_a_cut_past_is_the_same_past() -> None:
     for t_ns in (STEP // 3, STEP, 7 * STEP // 2):
-        history, newest = filled(5)
-        whole = history.at(t_ns)
-        cut = history.cut(t_ns)
-        again = history.at(t_ns)
-        assert whole is not None
-        assert cut is not None
-        assert again is not None
-        assert_same(cut, whole[0], 1e-15)
-        assert again[0] is cut
-        assert np.abs(again[1] - whole[1]).max() < 1e-12
-        last = history.at(newest.t_ns)
+        whole, newest = filled(5)
+        _, psi = since(whole, 0)
+        history, _ = filled(5)
+        then, rest = since(history, t_ns)
+        assert history.cut(t_ns) is not None
+        assert np.abs(since(history, 0)[1] - psi).max() < 1e-12
+        # Noise divides with time: what was there, and what has come since, is the whole.
+        grown = (newest.cov - rest @ then.cov @ rest.T)[0, 0] + (then.cov - KNOWN_HEADING)[0, 0]
+        assert grown == pytest.approx((newest.cov - psi @ KNOWN_HEADING @ psi.T)[0, 0])
+        last = history.cut(newest.t_ns)
         assert last is not None
-        assert last[0] is newest
+        assert_same(last, newest, 1e-15)
     assert history.cut(-1) is None
     assert history.cut(6 * STEP) is None
 
 
-@pytest.mark.parametrize("look", ["at", "cut"])
-def test_the_ring_is_bounded_in_time_and_number(look: str) -> None:
+def test_the_ring_is_bounded_in_time_and_number() -> None:
     history, _ = filled(100, horizon_ns=NS)
     assert len(history) <= 12
     assert history.oldest_ns <= 9 * NS
-    find: Callable[[int], object] = getattr(history, look)
-    assert find(9 * NS) is not None
-    assert find(8 * NS) is None
+    assert history.cut(9 * NS) is not None
+    assert history.cut(8 * NS) is None
     many, newest = filled(MAX_ENTRIES + 50, horizon_ns=10**6 * NS)
     assert len(many) == MAX_ENTRIES
     for k in range(20):
