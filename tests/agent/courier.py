@@ -59,6 +59,7 @@ class Letter:
     destination: str
     t_meas_ns: int
     body: Any
+    life: int = 1
 
 
 class Pair:
@@ -98,7 +99,7 @@ class Pair:
         self.agents[to].handle(LinkChange(self.now_ns, about, True, life, life))
 
     def _letters(self, robot: str, effects: list[Effect]) -> list[Letter]:
-        return [Letter(robot, item.peer, item.t_meas_ns, item.body) for item in sends(effects)]
+        return [Letter(robot, item.peer, item.t_meas_ns, item.body, self.lives[robot]) for item in sends(effects)]
 
     def cross(self) -> Array | None:
         """P_12 as the next contact would recover it."""
@@ -114,6 +115,11 @@ class Ledger:
         self._noise: dict[Epoch, tuple[int, Array]] = {}
         for name, (_, cov) in starts.items():
             self._add(name, np.linalg.cholesky(cov))
+
+    def begin_anew(self, robot: str, cov: Array) -> None:
+        """The error of `robot` is an independent one from now on."""
+        self.error[robot] = np.zeros_like(self.error[robot])
+        self._add(robot, np.linalg.cholesky(cov))
 
     def _columns(self, count: int) -> None:
         for name, rows in self.error.items():

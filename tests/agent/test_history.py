@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -79,6 +79,8 @@ ARRIVALS = st.lists(st.tuples(st.integers(1, 5), st.integers(0, 5)), min_size=1,
 
 @settings(max_examples=15, deadline=None)
 @given(ARRIVALS)
+@example([(4, 1), (1, 5)])
+@example([(3, 1), (2, 3), (5, 0)])
 def test_the_covariance_is_that_of_the_errors_whatever_the_order(arrivals: list[tuple[int, int]]) -> None:
     """The estimate is linear in what it is told: its response to every unit noise gives its true covariance.
 
