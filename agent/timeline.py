@@ -72,6 +72,7 @@ class OdometryTrack:
     def __init__(self, coast: CoastSettings, tolerance_ns: int, counters: Counter[str]) -> None:
         self._coast, self._tolerance_ns, self._counters = coast, tolerance_ns, counters
         self._increments: deque[Odometry] = deque()
+        self._gap_ns: tuple[int, int] | None = None
 
     @property
     def end_ns(self) -> int | None:
@@ -102,8 +103,8 @@ class OdometryTrack:
         """The next stretch from `state_ns` towards `until_ns` > state_ns: (its end, delta (4,), cov (4, 4)).
 
         It ends at the end of an increment, at `until_ns`, or where a gap ends. Without odometry the stretch
-        is a coast: zero motion with the covariance of an unknown constant velocity. The end always lies beyond
-        `state_ns`.
+        is a coast: zero motion with the covariance of a velocity that is unknown and constant over the whole gap. The
+        end always lies beyond `state_ns`.
         """
         tolerance = self._tolerance_ns
         self._drop_used(state_ns)
@@ -126,6 +127,9 @@ class OdometryTrack:
 
     def _coasted(self, state_ns: int, until_ns: int) -> tuple[int, Array, Array]:
         self._counters["odometry.coasted"] += 1
-        dt = (until_ns - state_ns) * 1e-9
-        moved, turned = (self._coast.speed_mps * dt) ** 2, (self._coast.yaw_rate_radps * dt) ** 2
+        start = self._gap_ns[0] if self._gap_ns is not None and self._gap_ns[1] == state_ns else state_ns
+        self._gap_ns = (start, until_ns)
+        # The velocity is the same all through a gap: however often it is cut, the variances add up to the same.
+        dt2 = ((until_ns - start) * 1e-9) ** 2 - ((state_ns - start) * 1e-9) ** 2
+        moved, turned = self._coast.speed_mps**2 * dt2, self._coast.yaw_rate_radps**2 * dt2
         return until_ns, np.zeros(4), np.diag([moved, moved, moved, turned])
