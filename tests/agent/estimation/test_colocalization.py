@@ -53,7 +53,7 @@ def options(transform: Transform = "unscented", cap: float = 0.0) -> Options:
 @given(SEED)
 def test_absolute_information_is_used_as_by_a_kalman_filter(transform: Transform, kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    mean, cov = rng.uniform(-2.0, 2.0, size=3), random_covariance(rng, 3) * 0.2
+    mean, cov = rng.uniform(-2.0, 2.0, size=3), random_covariance(rng, 3) * 0.02
     model = AbsoluteModel(kind, 3)
     H = model.jacobian(mean)
     z, R = H @ mean + rng.normal(size=len(H)) * 0.3, random_covariance(rng, len(H)) * 0.1
