@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import UNICYCLE, TargetMotion
 from agent.estimation.observation import RelativeModel
+from agent.estimation.unscented import Transform
 from sim.centralized import CentralizedFilter
 
 Array = NDArray[np.float64]
@@ -100,3 +101,22 @@ def test_an_outlier_is_weakened_by_the_cap_alone(cap: float) -> None:
     moved = float(np.hypot(*(subject.belief("r1")[0] - before)[:2]))
     assert (moved > 20.0) == (cap == 0.0)
     np.linalg.cholesky(subject.cov)
+
+
+@pytest.mark.parametrize("transform", ["unscented", "linearized", "jacobian"])
+def test_the_joint_covariance_stays_symmetric_and_positive_definite(transform: Transform) -> None:
+    """Four robots and a target, sharp measurements of all kinds, 300 steps (seed 22)."""
+    rng = np.random.default_rng(22)
+    robots = {f"r{k}": (rng.uniform(-8.0, 8.0, 3), np.diag([0.3, 0.2, 0.01]), UNICYCLE) for k in range(1, 5)}
+    subject = CentralizedFilter(robots, TARGETS, LANDMARKS, transform)
+    for _ in range(300):
+        for name in robots:
+            subject.odometry(name, np.array([rng.uniform(0.0, 0.4), 0.0, 0.0, rng.uniform(-0.2, 0.2)]), NOISE)
+        subject.drift_targets(0.5)
+        subject.fix("r1", "pose", subject.belief("r1")[0] + rng.normal(size=3) * 0.01, np.diag([1e-4, 1e-4, 1e-5]))
+        for name, of in (("r1", "r2"), ("r2", "target:t1"), ("r3", "r1"), ("r4", "landmark:L1")):
+            point = LANDMARKS["L1"] if of.startswith("landmark") else subject.belief(of.removeprefix("target:"))[0]
+            distance = float(np.hypot(*(np.asarray(point)[:2] - subject.belief(name)[0][:2])))
+            subject.observe(name, "range", of, np.array([distance + rng.normal() * 0.02]), np.array([[4e-4]]))
+        assert np.array_equal(subject.cov, subject.cov.T)
+        np.linalg.cholesky(subject.cov)
