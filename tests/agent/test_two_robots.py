@@ -118,6 +118,39 @@ def test_two_robots_equal_the_joint_filter(seed: int, private: bool) -> None:
     assert counters["pair.applied_initiator"] == counters["pair.applied_responder"] == used
 
 
+@pytest.mark.parametrize("seed", [31, 32])
+def test_a_lost_reply_leaves_the_joint_filter_with_zero_gain_for_the_initiator(seed: int) -> None:
+    """Nonlinear, 300 steps: a third of the contacts get no reply through; the other robot opens the next one."""
+    rng = np.random.default_rng(seed)
+    pair, joint = Pair(STARTS, timeout_s=1000.0), JointFilter(STARTS)
+    owner, lost = 0, 0
+    for k in range(1, 301):
+        for index, name in enumerate((FIRST, SECOND)):
+            delta = np.array([rng.uniform(0.0, 0.4), rng.uniform(-0.1, 0.1), 0.0, rng.uniform(-0.2, 0.2)])
+            pair.odometry(name, (k - 1) * NS, k * NS, delta, NOISE)
+            joint.odometry(index, delta, NOISE)
+        if rng.random() < 0.6:
+            order = [0, 1, 2, 3, 4, 5] if owner == 0 else [3, 4, 5, 0, 1, 2]
+            model, R = RelativeModel("range_bearing", 3), np.diag([0.05, 0.02]) ** 2
+            z = model.h(joint.x[order]) + rng.normal(size=2) * 0.02
+            H = np.zeros((2, 6))
+            H[:, order] = model.jacobian(joint.x[order])
+            innovation = z - model.h(joint.x[order])
+            innovation[1] = wrap(innovation[1:])[0]
+            (request,) = pair.measure((FIRST, SECOND)[owner], k * NS, "range_bearing", z, R)
+            (reply,) = pair.deliver(request)
+            if rng.random() < 0.35:
+                joint.update(H, innovation, R, zero=owner)
+                lost, owner = lost + 1, 1 - owner
+            else:
+                pair.deliver(reply)
+                joint.update(H, innovation, R)
+        assert_equal(pair, joint, 1e-9, f"seed {seed}, step {k}")
+    counters = pair.agents[FIRST].counters + pair.agents[SECOND].counters
+    assert lost > 30
+    assert counters["pair.applied_responder"] - counters["pair.applied_initiator"] == lost
+
+
 @pytest.mark.parametrize("delay", [1, 4, 9])
 def test_a_late_reply_gives_the_in_time_result_when_linear(delay: int) -> None:
     """Headings known: the initiator applies a contact `delay` steps late, with odometry in between."""
