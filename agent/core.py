@@ -290,20 +290,27 @@ class Agent:
             self.history.updated(state, None if own is None else own.left)
 
     def _contact(self, t_ns: int, event: Observation, effects: list[Effect]) -> None:
-        """Open a contact for a measurement of a peer, with all measurements of that peer at this instant."""
+        """Open a contact for a measurement of a peer, with all measurements of that peer at this instant.
+
+        A two-way range is known to both robots: the lower id uses it.
+        """
         assert event.of is not None
         peer = event.of
-        measurements = [Measurement(event.kind, event.z, event.R, event.mount)]
+        events = [event]
         while (item := self._timeline.peek()) is not None:
             same = item.t_ns == t_ns and item.phase is Phase.PAIR and item.source == peer
             if not same or not isinstance(item.event, Observation):
                 break
-            other = self._timeline.pop().event
-            assert isinstance(other, Observation)
-            measurements.append(Measurement(other.kind, other.z, other.R, other.mount))
-        two_way = event.kind == "range" and event.sensor not in self.settings.one_way_sensors
-        if two_way and peer < self.settings.robot:
-            self.counters["pair.not_owner"] += 1
+            self._timeline.pop()
+            events.append(item.event)
+        measurements = []
+        for found in events:
+            two_way = found.kind == "range" and found.sensor not in self.settings.one_way_sensors
+            if two_way and peer < self.settings.robot:
+                self.counters["pair.not_owner"] += 1
+            else:
+                measurements.append(Measurement(found.kind, found.z, found.R, found.mount))
+        if not measurements:
             return
         self.state, request = self._pairs.measured(
             peer, t_ns, self.now_ns, tuple(measurements), self.state, self.history

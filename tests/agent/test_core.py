@@ -12,10 +12,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from agent.core import Agent
+from agent.effects import Send
 from agent.estimation.motion import split_increment
 from agent.events import Event, Fix, Observation, Odometry, Tick
 from agent.recording import pack
 from agent.settings import NS, AgentSettings, LatenessSettings, LocalizationSettings
+from network.messages import PairRequest
 
 Array = NDArray[np.float64]
 
@@ -175,6 +177,23 @@ def test_what_is_not_used_is_counted(event: Event, counter: str) -> None:
     subject.handle(event)
     assert subject.counters[counter] == 1
     assert subject.state.mean is before.mean
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 0, 2)])
+def test_the_higher_id_keeps_what_is_its_own_besides_a_two_way_range(order: tuple[int, ...]) -> None:
+    """Bearing and one-way range of a lower id count, whatever comes first; the two-way range is the lower id's."""
+    base = agent(settle_ns=NS // 2).settings
+    subject = Agent(replace(base, one_way_sensors=("camera",)))
+    seen = [
+        Observation(NS, NS, "range", "r0", np.array([3.0]), np.eye(1), "uwb"),
+        Observation(NS, NS, "bearing", "r0", np.array([0.1]), np.eye(1), "camera"),
+        Observation(NS, NS, "range", "r0", np.array([3.0]), np.eye(1), "camera"),
+    ]
+    fed(subject, odometry(0, NS), *(seen[index] for index in order))
+    (request,) = [effect.body for effect in subject.handle(Tick(2 * NS)) if isinstance(effect, Send)]
+    assert isinstance(request, PairRequest)
+    assert sorted(item.kind for item in request.measurements) == ["bearing", "range"]
+    assert subject.counters["pair.not_owner"] == 1
 
 
 def test_buffers_are_bounded() -> None:
