@@ -64,8 +64,11 @@ class ZenohSettings:
 
 
 def link_pair(host: str, port: int) -> tuple[str, str]:
-    """The two links of a peer: datagrams for periodic state, a stream for directed messages."""
-    return f"udp/{host}:{port}?rel=0", f"tcp/{host}:{port}?rel=1"
+    """The two links of a peer: a stream for directed messages, datagrams for periodic state.
+
+    The stream comes first: what a session declares goes over the first link, and is never repeated if lost.
+    """
+    return f"tcp/{host}:{port}?rel=1", f"udp/{host}:{port}?rel=0"
 
 
 def key_of(fleet: str, packet: Packet) -> str:
