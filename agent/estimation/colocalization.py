@@ -258,6 +258,8 @@ def pair_update(
 
     (mean, cov) is the belief now, psi (n, n) its left factor since the contact, C_own (n, m). None when the
     posterior is not positive definite; skipping is safe.
+
+    `left` = P+ P^-1 is the rule for third parties (UT-CLAT eq. 28): exact for psi = I, an approximation otherwise.
     """
     return _applied(mean, cov, layout, gain(psi @ C_own, found.S), found.S, found.innovation, found.nis)
 
