@@ -206,7 +206,7 @@ class Agent:
             self.state = self._pairs.request(event, item.t_ns, self.state, self.history, effects)
         elif isinstance(event, Fix):
             if event.kind in ABSOLUTE:
-                self._absolute(item.t_ns, event.kind, AbsoluteModel(event.kind, len(self.state.mean)), event)
+                self._absolute(item.t_ns, event.kind, AbsoluteModel(event.kind, self.settings.layout), event)
             else:
                 self.counters["fix.unused_kind"] += 1
         elif item.phase is Phase.PRIVATE:
@@ -251,7 +251,7 @@ class Agent:
         if position is None:
             self.counters["observation.unknown_landmark"] += 1
             return
-        model = RelativeModel(event.kind, len(self.state.mean), event.mount, position)
+        model = RelativeModel(event.kind, self.settings.layout, event.mount, position)
         self._absolute(t_ns, f"landmark_{event.kind}", model, event)
 
     def _sighting(self, t_ns: int, event: Observation) -> None:
@@ -269,7 +269,7 @@ class Agent:
         own, track, nis = sighting_update(
             (self.state.mean, self.state.cov, self.settings.layout),
             (target.mean, target.cov, layout),
-            RelativeModel(event.kind, len(self.state.mean), event.mount),
+            RelativeModel(event.kind, self.settings.layout, event.mount),
             event.z,
             event.R,
             localization.sighting_weight,

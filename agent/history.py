@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from agent.belief import BlockKey, CorrelationStack, Part, RobotState, TargetState
 from agent.estimation.colocalization import Update
 from agent.estimation.gaussian import gain, is_positive_definite, symmetrize, wrap_components
-from agent.estimation.motion import advance, split_increment
+from agent.estimation.motion import split_increment
 from agent.settings import AgentSettings
 from network.messages import Epoch
 
@@ -46,9 +46,11 @@ def moved(
 ) -> tuple[RobotState, Array]:
     """State and targets predicted to `t_ns` with an odometry increment; returns (state, F (n, n))."""
     localization = settings.localization
-    own = advance(state.mean, state.cov, delta, cov, localization.transform, localization.parameters)
-    targets = {}
     dt_s = (t_ns - state.t_ns) * 1e-9
+    own = settings.motion.advance(
+        state.mean, state.cov, delta, cov, dt_s, localization.transform, localization.parameters
+    )
+    targets = {}
     for target in settings.targets:
         belief = state.targets.get(target.id)
         if belief is not None:
@@ -116,7 +118,10 @@ class History:
         first, first_cov, second, second_cov = split_increment(following.delta, following.delta_cov, share)
         state, F = moved(self._settings, entry.state, t_ns, first, first_cov)
         localization = self._settings.localization
-        rest = advance(state.mean, state.cov, second, second_cov, localization.transform, localization.parameters)
+        rest_s = (self._stamps[index + 1] - t_ns) * 1e-9
+        rest = self._settings.motion.advance(
+            state.mean, state.cov, second, second_cov, rest_s, localization.transform, localization.parameters
+        )
         following.delta, following.delta_cov, following.F = second, second_cov, rest.F
         self._entries.insert(index + 1, Entry(state, first, first_cov, F, np.eye(len(state.mean))))
         self._stamps.insert(index + 1, t_ns)

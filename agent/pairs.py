@@ -301,7 +301,13 @@ class Pairs:
         own_is_low = self._settings.robot < peer
         try:
             found = contact(
-                initiator, responder, own_is_low == own_initiated, measurements, correlated, self._options
+                initiator,
+                responder,
+                own_is_low == own_initiated,
+                measurements,
+                self._settings.layout,
+                correlated,
+                self._options,
             )
         except np.linalg.LinAlgError:
             self._counters["pair.indefinite"] += 1

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.intersection import Weight
-from agent.estimation.motion import UNICYCLE, StateLayout, TargetMotion
+from agent.estimation.motion import PLANAR_MOTION, RobotMotion, StateLayout, TargetMotion
 from agent.estimation.unscented import DEFAULT, Transform, UnscentedParameters
 
 Array = NDArray[np.float64]
@@ -92,7 +92,7 @@ class AgentSettings:
     start_ns: int
     mean: Array
     cov: Array
-    layout: StateLayout = UNICYCLE
+    motion: RobotMotion = PLANAR_MOTION
     targets: tuple[TargetSettings, ...] = ()
     landmarks: dict[str, tuple[float, float]] = field(default_factory=dict)
     one_way_sensors: tuple[str, ...] = ()
@@ -100,3 +100,7 @@ class AgentSettings:
     lateness: LatenessSettings = field(default_factory=LatenessSettings)
     coast: CoastSettings = field(default_factory=CoastSettings)
     track: bool = True
+
+    @property
+    def layout(self) -> StateLayout:
+        return self.motion.layout

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.config_parts import target_motion
-from agent.estimation.motion import LAYOUTS
+from agent.estimation.motion import LAYOUTS, RobotMotion
 from agent.events import Odometry
 from agent.settings import CoastSettings
 from agent.timeline import OdometryTrack
@@ -25,7 +25,7 @@ class BoundRunner:
     def __init__(self, scenario: Scenario, world: World) -> None:
         robots, targets = {}, {}
         for robot in scenario.robots:
-            robots[robot.id] = (*world.start_belief(robot.id), LAYOUTS[robot.model])
+            robots[robot.id] = (*world.start_belief(robot.id), RobotMotion(LAYOUTS[robot.model]))
         for target in scenario.targets:
             motion = target_motion(target.model, target.control, target.noise, scenario.step_s, target.damping_s)
             targets[target.id] = (*world.start_belief(target.id), motion)
@@ -77,7 +77,7 @@ class BoundRunner:
     def _advance(self, robot: str, t_ns: int) -> None:
         while self._now[robot] < t_ns:
             end, delta, cov = self._tracks[robot].step(self._now[robot], t_ns)
-            self._filter.odometry(robot, delta, cov)
+            self._filter.odometry(robot, delta, cov, (end - self._now[robot]) * 1e-9)
             self._now[robot] = end
 
     def _drift(self, t_ns: int) -> None:

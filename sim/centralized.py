@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian import gain, quadratic_form, symmetrize, wrap_components
-from agent.estimation.motion import StateLayout, TargetMotion, advance
+from agent.estimation.motion import RobotMotion, TargetMotion
 from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.estimation.unscented import Propagated, Transform, observe
 
@@ -18,11 +18,11 @@ Array = NDArray[np.float64]
 
 
 class CentralizedFilter:
-    """Joint belief of robots {id: (mean (n,), cov (n, n), layout)} and targets {id: (mean, cov, motion)}."""
+    """Joint belief of robots {id: (mean (n,), cov (n, n), motion)} and targets {id: (mean, cov, motion)}."""
 
     def __init__(
         self,
-        robots: dict[str, tuple[Array, Array, StateLayout]],
+        robots: dict[str, tuple[Array, Array, RobotMotion]],
         targets: dict[str, tuple[Array, Array, TargetMotion]],
         landmarks: dict[str, tuple[float, float]],
         transform: Transform = "unscented",
@@ -30,8 +30,9 @@ class CentralizedFilter:
     ) -> None:
         self._landmarks, self._transform, self._cap = landmarks, transform, innovation_cap
         self._motions = {name: motion for name, (_, _, motion) in targets.items()}
+        self._robot_motions = {name: motion for name, (_, _, motion) in robots.items()}
         self._parts: dict[str, slice] = {}
-        starts = [(name, mean, cov, layout) for name, (mean, cov, layout) in robots.items()]
+        starts = [(name, mean, cov, motion.layout) for name, (mean, cov, motion) in robots.items()]
         starts += [(name, mean, cov, motion.layout) for name, (mean, cov, motion) in targets.items()]
         size = sum(len(mean) for _, mean, _, _ in starts)
         self.mean, self.cov = np.zeros(size), np.zeros((size, size))
@@ -53,9 +54,10 @@ class CentralizedFilter:
         """Cross-covariance (n_a, n_b)."""
         return np.array(self.cov[self._parts[first], self._parts[second]])
 
-    def odometry(self, robot: str, delta: Array, cov: Array) -> None:
-        """Move a robot by an increment (4,) with covariance (4, 4)."""
-        self._predict(robot, advance(*self.belief(robot), delta, cov, self._transform))
+    def odometry(self, robot: str, delta: Array, cov: Array, dt_s: float) -> None:
+        """Move a robot by an increment (4,) with covariance (4, 4) over `dt_s` seconds."""
+        motion = self._robot_motions[robot]
+        self._predict(robot, motion.advance(*self.belief(robot), delta, cov, dt_s, self._transform))
 
     def drift_targets(self, dt_s: float) -> None:
         """Move all targets by their models."""
@@ -64,20 +66,19 @@ class CentralizedFilter:
 
     def fix(self, robot: str, kind: str, z: Array, R: Array) -> None:
         """Absolute information z (m,), R (m, m)."""
-        part = self._parts[robot]
-        self._update(self._rows(robot), AbsoluteModel(kind, part.stop - part.start), z, R)
+        self._update(self._rows(robot), AbsoluteModel(kind, self._robot_motions[robot].layout), z, R)
 
     def observe(
         self, robot: str, kind: str, of: str, z: Array, R: Array, mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> None:
         """A relative measurement of `r2`, `landmark:L3` or `target:t1`."""
-        rows = self._rows(robot)
+        rows, layout = self._rows(robot), self._robot_motions[robot].layout
         if of.startswith("landmark:"):
             point = self._landmarks[of.removeprefix("landmark:")]
-            self._update(rows, RelativeModel(kind, len(rows), mount, point), z, R)
+            self._update(rows, RelativeModel(kind, layout, mount, point), z, R)
             return
         other = self._rows(of.removeprefix("target:"))
-        self._update(np.concatenate([rows, other]), RelativeModel(kind, len(rows), mount), z, R)
+        self._update(np.concatenate([rows, other]), RelativeModel(kind, layout, mount), z, R)
 
     def _rows(self, name: str) -> NDArray[np.intp]:
         part = self._parts[name]

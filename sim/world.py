@@ -196,9 +196,9 @@ class SimulatedWorld:
             return [Output(t_ns, Phase.PRIVATE, robot.id, name, kind, None, z, R)]
         outputs = []
         for of, position in self._subjects(robot, sensor, kind, k):
-            model = RelativeModel(kind, len(state), (sensor.mount[0], sensor.mount[1], sensor.mount[2]))
+            model = RelativeModel(kind, LAYOUTS[robot.model], (sensor.mount[0], sensor.mount[1], sensor.mount[2]))
             joint = np.concatenate([state, position])
-            distance = float(RelativeModel("range", len(state), model.mount).h(joint)[0])
+            distance = float(RelativeModel("range", LAYOUTS[robot.model], model.mount).h(joint)[0])
             if sensor.max_range_m is not None and distance > sensor.max_range_m:
                 continue
             R = relative_noise(kind, sensor, distance)

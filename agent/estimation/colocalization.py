@@ -211,13 +211,14 @@ def contact(
     responder: Snapshot,
     initiator_is_low: bool,
     measurements: Sequence[Measurement],
+    layout: StateLayout,
     correlated: bool,
     options: Options,
 ) -> Contact:
     """Innovation and gains of a pair update (UT-CLAT 3.3, eq. 18-25 with priors in S and full gains).
 
-    `correlated` False takes P_ij = 0 (the naive baseline). Raises `numpy.linalg.LinAlgError` for beliefs that
-    are not positive definite.
+    Both beliefs are of `layout`. `correlated` False takes P_ij = 0 (the naive baseline). Raises
+    `numpy.linalg.LinAlgError` for beliefs that are not positive definite.
     """
     P_i, P_j = initiator.belief.cov, responder.belief.cov
     n, m = len(P_i), len(P_j)
@@ -236,7 +237,7 @@ def contact(
         if not is_positive_definite(joint):
             cross = clip_canonical_correlations(P_i, cross, P_j)
             joint[:n, n:], joint[n:, :n] = cross, cross.T
-    models = [RelativeModel(item.kind, n, item.mount) for item in measurements]
+    models = [RelativeModel(item.kind, layout, item.mount) for item in measurements]
     model = models[0] if len(models) == 1 else StackedModel(models, [len(item.z) for item in measurements])
     z = np.concatenate([item.z for item in measurements])
     R = np.zeros((len(z), len(z)))

@@ -23,12 +23,13 @@ PLANAR = (0, 1, 3)
 
 @dataclass(frozen=True, slots=True)
 class StateLayout:
-    """Meaning of a state vector: its size, wrapped components, and where heading sits (None: no heading)."""
+    """Meaning of a state vector: its size, wrapped components, where heading (None: none) and position sit."""
 
     name: str
     dim: int
     angles: tuple[int, ...]
     heading: int | None
+    position: tuple[int, ...] = (0, 1)
 
 
 UNICYCLE = StateLayout("unicycle", 3, (2,), 2)
@@ -98,6 +99,29 @@ def advance(
         return compose(points, increment + noises)
 
     return propagate(move, mean, cov, root, UNICYCLE.angles, parameters)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotMotion:
+    """How a robot's own state moves with its odometry."""
+
+    layout: StateLayout = UNICYCLE
+
+    def advance(
+        self,
+        mean: Array,
+        cov: Array,
+        delta: Array,
+        delta_cov: Array,
+        dt_s: float,
+        transform: Transform,
+        parameters: UnscentedParameters = DEFAULT,
+    ) -> Propagated:
+        """Belief (n,), (n, n) after an odometry increment (4,) with covariance (4, 4) over `dt_s` > 0 seconds."""
+        return advance(mean, cov, delta, delta_cov, transform, parameters)
+
+
+PLANAR_MOTION = RobotMotion()
 
 
 @dataclass(frozen=True, slots=True)

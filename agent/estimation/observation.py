@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian import wrap
+from agent.estimation.motion import StateLayout
 
 Array = NDArray[np.float64]
 
@@ -30,10 +31,10 @@ NO_MOUNT = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AbsoluteModel:
-    """z = selected components of a state of size `dim`."""
+    """z = selected components of a state of `layout`."""
 
     kind: str
-    dim: int
+    layout: StateLayout
 
     @property
     def angles(self) -> tuple[int, ...]:
@@ -44,7 +45,7 @@ class AbsoluteModel:
 
     def jacobian(self, state: Array) -> Array:
         components = ABSOLUTE[self.kind][0]
-        H = np.zeros((*state.shape[:-1], len(components), self.dim))
+        H = np.zeros((*state.shape[:-1], len(components), self.layout.dim))
         for row, column in enumerate(components):
             H[..., row, column] = 1.0
         return H
@@ -54,14 +55,14 @@ class AbsoluteModel:
 class RelativeModel:
     """Range [m], bearing [rad] or both from an observer to a subject.
 
-    The stacked state is [observer (observer_dim); subject], the subject's position being its first two
-    components, or `landmark` (2,) when given (the stack is then the observer alone). `mount` is the sensor's
-    lever arm x, y [m, FLU] and yaw [rad] on the observer's body. The observer needs a heading unless the kind
-    is `range` and the lever arm is zero.
+    The stacked state is [observer; subject], the subject's position being its first two components, or
+    `landmark` (2,) when given (the stack is then the observer alone). `mount` is the sensor's lever arm x, y
+    [m, FLU] and yaw [rad] on the observer's body. The observer needs a heading unless the kind is `range` and
+    the lever arm is zero.
     """
 
     kind: str
-    observer_dim: int
+    observer: StateLayout
     mount: tuple[float, float, float] = NO_MOUNT
     landmark: tuple[float, float] | None = None
 
@@ -75,7 +76,7 @@ class RelativeModel:
         if self.landmark is not None:
             subject = np.asarray(self.landmark)
         else:
-            subject = state[..., self.observer_dim : self.observer_dim + 2]
+            subject = state[..., self.observer.dim : self.observer.dim + 2]
         x, y, _ = self.mount
         if x == 0.0 and y == 0.0:
             lever = np.zeros((*state.shape[:-1], 2))
@@ -110,7 +111,7 @@ class RelativeModel:
             row = np.zeros((*state.shape[:-1], n))
             row[..., :2] = -direction
             if self.landmark is None:
-                row[..., self.observer_dim : self.observer_dim + 2] = direction
+                row[..., self.observer.dim : self.observer.dim + 2] = direction
             if is_bearing or np.any(lever):
                 row[..., 2] = -np.sum(direction * turned, axis=-1) - (1.0 if is_bearing else 0.0)
             rows.append(row)

@@ -17,6 +17,7 @@ from agent.core import Agent
 from agent.effects import Effect, Send
 from agent.estimation.colocalization import resolve_cross
 from agent.estimation.gaussian import gain
+from agent.estimation.motion import UNICYCLE
 from agent.estimation.observation import RelativeModel
 from agent.events import LinkChange, Observation, Odometry, Received
 from agent.settings import NS, AgentSettings, LatenessSettings, LocalizationSettings
@@ -175,7 +176,7 @@ def gains_of(
     assert reply.snapshot is not None
     (item,) = request.measurements
     i, j = request.snapshot.belief, reply.snapshot.belief
-    H = RelativeModel(item.kind, 3).jacobian(np.concatenate([i.mean, j.mean]))
+    H = RelativeModel(item.kind, UNICYCLE).jacobian(np.concatenate([i.mean, j.mean]))
     joint = np.block([[i.cov, cross], [cross.T, j.cov]])
     S = H @ joint @ H.T + item.R
     C = joint @ H.T

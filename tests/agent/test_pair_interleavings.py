@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from agent.core import Agent
 from agent.estimation.colocalization import resolve_cross
+from agent.estimation.motion import UNICYCLE
 from agent.estimation.observation import RelativeModel
 from agent.events import Tick
 from agent.settings import NS
@@ -71,7 +72,7 @@ class Story:
         letters = []
         for name in who:
             own, other = self.pair.agents[name].state.mean, self.pair.agents[OTHER[name]].state.mean
-            z = RelativeModel("range_bearing", 3).h(np.concatenate([own, other])) + np.array([0.05, -0.02])
+            z = RelativeModel("range_bearing", UNICYCLE).h(np.concatenate([own, other])) + np.array([0.05, -0.02])
             letters += self.pair.measure(name, self.k * NS, "range_bearing", z, R)
         self.travel(letters)
 

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian import wrap
+from agent.estimation.motion import UNICYCLE
 from agent.estimation.observation import RelativeModel
 from agent.events import Fix
 from agent.settings import NS
@@ -99,7 +100,7 @@ def test_two_robots_equal_the_joint_filter(seed: int, private: bool) -> None:
             # A two-way range belongs to the lower id; bearings to whoever looks.
             owner = FIRST if kind == "range" or rng.random() < 0.5 else SECOND
             order = [0, 1, 2, 3, 4, 5] if owner == FIRST else [3, 4, 5, 0, 1, 2]
-            model = RelativeModel(kind, 3)
+            model = RelativeModel(kind, UNICYCLE)
             z = model.h(joint.x[order]) + rng.normal(size=len(model.angles) or 1) * 0.02
             if kind == "range_bearing":
                 z = model.h(joint.x[order]) + rng.normal(size=2) * 0.02
@@ -131,7 +132,7 @@ def test_a_lost_reply_leaves_the_joint_filter_with_zero_gain_for_the_initiator(s
             joint.odometry(index, delta, NOISE)
         if rng.random() < 0.6:
             order = [0, 1, 2, 3, 4, 5] if owner == 0 else [3, 4, 5, 0, 1, 2]
-            model, R = RelativeModel("range_bearing", 3), np.diag([0.05, 0.02]) ** 2
+            model, R = RelativeModel("range_bearing", UNICYCLE), np.diag([0.05, 0.02]) ** 2
             z = model.h(joint.x[order]) + rng.normal(size=2) * 0.02
             H = np.zeros((2, 6))
             H[:, order] = model.jacobian(joint.x[order])
@@ -168,7 +169,7 @@ def test_a_late_reply_gives_the_in_time_result_when_linear(delay: int) -> None:
                 pair.converse(pair.odometry(name, (k - 1) * NS, k * NS, delta, noise))
                 joint.odometry(index, delta, noise)
             if step == 0:
-                model = RelativeModel("range", 3)
+                model = RelativeModel("range", UNICYCLE)
                 z, R = model.h(joint.x) + 0.03, np.array([[0.04]])
                 requests = pair.measure(FIRST, k * NS, "range", z, R)
                 waiting = [reply for request in requests for reply in pair.deliver(request)]

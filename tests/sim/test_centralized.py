@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian import wrap
-from agent.estimation.motion import UNICYCLE, TargetMotion
+from agent.estimation.motion import PLANAR_MOTION, UNICYCLE, TargetMotion
 from agent.estimation.observation import RelativeModel
 from agent.estimation.unscented import Transform
 from sim.centralized import CentralizedFilter
@@ -15,8 +15,8 @@ from sim.centralized import CentralizedFilter
 Array = NDArray[np.float64]
 
 ROBOTS = {
-    "r1": (np.array([0.0, 0.0, 0.3]), np.diag([0.3, 0.2, 0.01]), UNICYCLE),
-    "r2": (np.array([6.0, 2.0, -1.0]), np.diag([0.4, 0.5, 0.02]), UNICYCLE),
+    "r1": (np.array([0.0, 0.0, 0.3]), np.diag([0.3, 0.2, 0.01]), PLANAR_MOTION),
+    "r2": (np.array([6.0, 2.0, -1.0]), np.diag([0.4, 0.5, 0.02]), PLANAR_MOTION),
 }
 MOTION = TargetMotion(UNICYCLE, (0.1, 0.02), (0.05, 0.03), 1.0)
 TARGETS = {"t1": (np.array([3.0, -4.0, 0.8]), np.diag([0.6, 0.6, 0.05]), MOTION)}
@@ -60,7 +60,7 @@ def test_it_is_the_joint_filter() -> None:
     for step in range(150):
         for name in ROBOTS:
             delta = np.array([rng.uniform(0.0, 0.4), rng.uniform(-0.1, 0.1), 0.0, rng.uniform(-0.2, 0.2)])
-            ours.odometry(name, delta, NOISE)
+            ours.odometry(name, delta, NOISE, 0.5)
             joint.move(name, delta[[0, 1, 3]], NOISE[np.ix_((0, 1, 3), (0, 1, 3))])
         ours.drift_targets(1.0)
         joint.move("t1", np.array([0.1, 0.0, 0.02]), np.diag([0.05**2, 0.0, 0.03**2]))
@@ -69,7 +69,7 @@ def test_it_is_the_joint_filter() -> None:
         kind = ("range", "bearing", "range_bearing")[int(rng.integers(3))]
         mount = (0.2, -0.1, 0.5)
         landmark = LANDMARKS["L1"] if of.startswith("landmark") else None
-        model = RelativeModel(kind, 3, mount, landmark)
+        model = RelativeModel(kind, UNICYCLE, mount, landmark)
         rows = list(range(START[robot], START[robot] + 3))
         if landmark is None:
             other = START[of.removeprefix("target:")]
@@ -107,11 +107,11 @@ def test_an_outlier_is_weakened_by_the_cap_alone(cap: float) -> None:
 def test_the_joint_covariance_stays_symmetric_and_positive_definite(transform: Transform) -> None:
     """Four robots and a target, sharp measurements of all kinds, 300 steps (seed 22)."""
     rng = np.random.default_rng(22)
-    robots = {f"r{k}": (rng.uniform(-8.0, 8.0, 3), np.diag([0.3, 0.2, 0.01]), UNICYCLE) for k in range(1, 5)}
+    robots = {f"r{k}": (rng.uniform(-8.0, 8.0, 3), np.diag([0.3, 0.2, 0.01]), PLANAR_MOTION) for k in range(1, 5)}
     subject = CentralizedFilter(robots, TARGETS, LANDMARKS, transform)
     for _ in range(300):
         for name in robots:
-            subject.odometry(name, np.array([rng.uniform(0.0, 0.4), 0.0, 0.0, rng.uniform(-0.2, 0.2)]), NOISE)
+            subject.odometry(name, np.array([rng.uniform(0.0, 0.4), 0.0, 0.0, rng.uniform(-0.2, 0.2)]), NOISE, 0.5)
         subject.drift_targets(0.5)
         subject.fix("r1", "pose", subject.belief("r1")[0] + rng.normal(size=3) * 0.01, np.diag([1e-4, 1e-4, 1e-5]))
         for name, of in (("r1", "r2"), ("r2", "target:t1"), ("r3", "r1"), ("r4", "landmark:L1")):

@@ -54,7 +54,7 @@ def options(transform: Transform = "unscented", cap: float = 0.0) -> Options:
 def test_absolute_information_is_used_as_by_a_kalman_filter(transform: Transform, kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     mean, cov = rng.uniform(-2.0, 2.0, size=3), random_covariance(rng, 3) * 0.02
-    model = AbsoluteModel(kind, 3)
+    model = AbsoluteModel(kind, UNICYCLE)
     H = model.jacobian(mean)
     z, R = H @ mean + rng.normal(size=len(H)) * 0.3, random_covariance(rng, len(H)) * 0.1
     found = absolute_update(mean.copy(), cov, UNICYCLE, model, z, R, options(transform))
@@ -72,7 +72,7 @@ def test_absolute_information_is_used_as_by_a_kalman_filter(transform: Transform
 def test_a_heading_fix_across_the_half_turn_moves_the_heading_the_short_way() -> None:
     mean, cov = np.array([0.0, 0.0, 3.1]), np.diag([1.0, 1.0, 0.04])
     found = absolute_update(
-        mean, cov, UNICYCLE, AbsoluteModel("heading", 3), np.array([-3.1]), np.array([[0.04]]), options()
+        mean, cov, UNICYCLE, AbsoluteModel("heading", UNICYCLE), np.array([-3.1]), np.array([[0.04]]), options()
     )
     assert found is not None
     assert abs(abs(float(found.mean[2])) - np.pi) < 1e-9
@@ -83,7 +83,8 @@ def test_a_heading_fix_across_the_half_turn_moves_the_heading_the_short_way() ->
 def test_the_cap_inflates_the_innovation_covariance_until_the_nis_is_the_cap(cap: float) -> None:
     """One dimension by hand: S' = S nis / cap, hence K' = K cap / nis and P' = P - K' S' K'^T."""
     cov, R, z = np.diag([1.0, 1.0, 0.5]), np.array([[0.5]]), np.array([2.5])
-    found = absolute_update(np.zeros(3), cov, UNICYCLE, AbsoluteModel("heading", 3), z, R, options("jacobian", cap))
+    heading = AbsoluteModel("heading", UNICYCLE)
+    found = absolute_update(np.zeros(3), cov, UNICYCLE, heading, z, R, options("jacobian", cap))
     assert found is not None
     assert found.nis == pytest.approx(2.5**2)
     capped = 2.5**2 / cap
@@ -92,7 +93,7 @@ def test_the_cap_inflates_the_innovation_covariance_until_the_nis_is_the_cap(cap
 
 
 def test_an_innovation_below_the_cap_is_used_in_full() -> None:
-    arguments = (np.zeros(3), np.eye(3), UNICYCLE, AbsoluteModel("position", 3), np.array([0.5, 0.1]), np.eye(2))
+    arguments = (np.zeros(3), np.eye(3), UNICYCLE, AbsoluteModel("position", UNICYCLE), np.array([0.5, 0.1]), np.eye(2))
     capped, plain = absolute_update(*arguments, options(cap=4.0)), absolute_update(*arguments, options())
     assert capped is not None
     assert plain is not None
@@ -117,7 +118,7 @@ def sighting(
     )
 
 
-SEES = RelativeModel("range_bearing", 3)
+SEES = RelativeModel("range_bearing", UNICYCLE)
 R_SEES = np.diag([0.05**2, 0.02**2])
 OWN_TRUTH, TARGET_TRUTH = np.array([1.0, 2.0, 0.4]), np.array([9.0, 5.0, -1.0])
 
@@ -250,9 +251,9 @@ def test_a_contact_applied_by_both_is_the_joint_update(transform: Transform, ini
     pair = (low, high) if initiator_is_low else (high, low)
     order = np.arange(6) if initiator_is_low else np.array([3, 4, 5, 0, 1, 2])
     arranged = joint[np.ix_(order, order)]
-    found = contact(*pair, initiator_is_low, BOTH, True, options(transform))
+    found = contact(*pair, initiator_is_low, BOTH, UNICYCLE, True, options(transform))
     state = np.concatenate([pair[0].belief.mean, pair[1].belief.mean])
-    model = StackedModel([RelativeModel(item.kind, 3, item.mount) for item in BOTH], [1, 1])
+    model = StackedModel([RelativeModel(item.kind, UNICYCLE, item.mount) for item in BOTH], [1, 1])
     z, R = np.array([5.6, 0.15]), np.diag([0.01, 0.002])
     whole = absolute_update(state, arranged, TWO, model, z, R, options(transform))  # type: ignore[arg-type]
     assert whole is not None
@@ -274,7 +275,7 @@ TWO = type(UNICYCLE)("two robots", 6, (2, 5), 2)
 def test_a_contact_applied_late_is_the_contact_applied_in_time_and_moved() -> None:
     rng = np.random.default_rng(62)
     joint = random_joint(rng)
-    found = contact(*snapshots(joint), True, BOTH, True, options())
+    found = contact(*snapshots(joint), True, BOTH, UNICYCLE, True, options())
     F, Q = np.eye(3) + 0.1 * rng.normal(size=(3, 3)), random_covariance(rng, 3) * 0.01
     in_time = pair_update(LOW_MEAN, joint[:3, :3], UNICYCLE, np.eye(3), found.C_i, found)
     late = pair_update(F @ LOW_MEAN, F @ joint[:3, :3] @ F.T + Q, UNICYCLE, F, found.C_i, found)
@@ -286,18 +287,18 @@ def test_a_contact_applied_late_is_the_contact_applied_in_time_and_moved() -> No
 
 def test_a_contact_that_would_leave_no_covariance_is_refused() -> None:
     """A belief now that is better than what the old contact still had to give."""
-    found = contact(*snapshots(random_joint(np.random.default_rng(71))), True, BOTH, True, options())
+    found = contact(*snapshots(random_joint(np.random.default_rng(71))), True, BOTH, UNICYCLE, True, options())
     assert pair_update(LOW_MEAN, np.eye(3) * 1e-6, UNICYCLE, np.eye(3), found.C_i, found) is None
 
 
 def test_the_naive_contact_takes_the_pair_for_uncorrelated() -> None:
     joint = random_joint(np.random.default_rng(63))
-    found = contact(*snapshots(joint), True, BOTH, False, options("jacobian"))
+    found = contact(*snapshots(joint), True, BOTH, UNICYCLE, False, options("jacobian"))
     assert found.cross is not None
     assert not found.cross.any()
     blind = joint.copy()
     blind[:3, 3:] = blind[3:, :3] = 0.0
-    honest = contact(*snapshots(blind), True, BOTH, True, options("jacobian"))
+    honest = contact(*snapshots(blind), True, BOTH, UNICYCLE, True, options("jacobian"))
     assert np.allclose(found.S, honest.S)
     assert np.allclose(found.C_i, honest.C_i)
 
@@ -306,7 +307,7 @@ def test_an_inadmissible_correlation_is_clipped_before_it_is_used() -> None:
     joint = random_joint(np.random.default_rng(64))
     low, high = snapshots(joint)
     low = Snapshot(low.belief, NEW, joint[:3, 3:] * 20.0, np.eye(3))
-    found = contact(low, high, True, BOTH, True, options())
+    found = contact(low, high, True, BOTH, UNICYCLE, True, options())
     assert found.cross is not None
     repaired = joint.copy()
     repaired[:3, 3:], repaired[3:, :3] = found.cross, found.cross.T
@@ -319,15 +320,15 @@ def test_a_contact_of_unknown_correlation_says_so() -> None:
     forgotten = Snapshot(low.belief, NEW, low.factor, low.line, known=False)
     for initiator_is_low in (True, False):
         pair = (forgotten, high) if initiator_is_low else (high, forgotten)
-        assert contact(*pair, initiator_is_low, BOTH, True, options()).cross is None
+        assert contact(*pair, initiator_is_low, BOTH, UNICYCLE, True, options()).cross is None
 
 
 @pytest.mark.parametrize("cap", [1.0, 6.0])
 def test_the_cap_of_a_contact_is_met_exactly(cap: float) -> None:
     joint = random_joint(np.random.default_rng(66))
     outlier = [Measurement("range_bearing", np.array([30.0, 2.0]), np.diag([0.01, 0.01]))]
-    plain = contact(*snapshots(joint), True, outlier, True, options())
-    capped = contact(*snapshots(joint), True, outlier, True, options(cap=cap))
+    plain = contact(*snapshots(joint), True, outlier, UNICYCLE, True, options())
+    capped = contact(*snapshots(joint), True, outlier, UNICYCLE, True, options(cap=cap))
     assert plain.nis > cap
     assert capped.nis == pytest.approx(plain.nis)
     assert float(capped.innovation @ np.linalg.solve(capped.S, capped.innovation)) / 2.0 == pytest.approx(cap)
@@ -338,7 +339,7 @@ def test_pairs_stay_honest_when_their_correlation_is_kept() -> None:
     """Two robots range each other ten times, each updating itself alone: NEES of either (seed 67)."""
     rng, trials = np.random.default_rng(67), 300
     cov, nees = np.diag([0.05, 0.05, 0.002]), {True: np.zeros(trials), False: np.zeros(trials)}
-    model, R = RelativeModel("range_bearing", 3), np.diag([0.01, 0.002])
+    model, R = RelativeModel("range_bearing", UNICYCLE), np.diag([0.01, 0.002])
     truth = np.concatenate([LOW_MEAN, HIGH_MEAN])
     for correlated, trial in itertools.product((True, False), range(trials)):
         means = [rng.multivariate_normal(LOW_MEAN, cov), rng.multivariate_normal(HIGH_MEAN, cov)]
@@ -347,7 +348,7 @@ def test_pairs_stay_honest_when_their_correlation_is_kept() -> None:
             item = Measurement("range_bearing", model.h(truth) + rng.normal(size=2) * np.sqrt(np.diagonal(R)), R)
             low = Snapshot(Belief("unicycle", means[0], covs[0]), NEW, cross, np.eye(3))
             high = Snapshot(Belief("unicycle", means[1], covs[1]), NEW, np.eye(3), np.eye(3))
-            found = contact(low, high, True, [item], correlated, options())
+            found = contact(low, high, True, [item], UNICYCLE, correlated, options())
             for side, C in enumerate((found.C_i, found.C_j)):
                 update = pair_update(means[side], covs[side], UNICYCLE, np.eye(3), C, found)
                 assert update is not None
@@ -416,7 +417,7 @@ def test_the_correlation_is_that_of_the_errors_whoever_applied_the_last_contact(
     """A contact, then both move: P_ab from the snapshots is the joint filter's with the other's gain set to zero."""
     rng = np.random.default_rng(68)
     joint = random_joint(rng)
-    found = contact(*snapshots(joint), True, BOTH, True, options("jacobian"))
+    found = contact(*snapshots(joint), True, BOTH, UNICYCLE, True, options("jacobian"))
     F_low, F_high = np.eye(3) + 0.2 * rng.normal(size=(3, 3)), np.eye(3) + 0.2 * rng.normal(size=(3, 3))
     epoch = Epoch(4, "r1", 2)
     low = (
@@ -438,7 +439,7 @@ def test_the_correlation_is_that_of_the_errors_whoever_applied_the_last_contact(
 def test_stacked_models_are_the_models_one_above_the_other() -> None:
     rng = np.random.default_rng(69)
     kinds = ("bearing", "range_bearing", "range", "bearing")
-    models = [RelativeModel(kind, 3, (0.1 * k, -0.1, 0.2 * k)) for k, kind in enumerate(kinds)]
+    models = [RelativeModel(kind, UNICYCLE, (0.1 * k, -0.1, 0.2 * k)) for k, kind in enumerate(kinds)]
     stacked = StackedModel(models, [1, 2, 1, 1])
     assert stacked.angles == (0, 2, 4)
     states = rng.normal(size=(5, 6)) * 3.0
@@ -452,11 +453,11 @@ def test_measurements_of_one_instant_are_as_good_together_as_in_turn() -> None:
     """To first order: with the same Jacobians the joint posterior is that of one after the other."""
     joint = random_joint(np.random.default_rng(70), 1e-7)
     exact = np.concatenate([LOW_MEAN, HIGH_MEAN])
-    items = [Measurement(i.kind, RelativeModel(i.kind, 3, i.mount).h(exact), i.R * 1e-5, i.mount) for i in BOTH]
-    together = contact(*snapshots(joint), True, items, True, options("jacobian"))
+    items = [Measurement(i.kind, RelativeModel(i.kind, UNICYCLE, i.mount).h(exact), i.R * 1e-5, i.mount) for i in BOTH]
+    together = contact(*snapshots(joint), True, items, UNICYCLE, True, options("jacobian"))
     both = pair_update(LOW_MEAN, joint[:3, :3], UNICYCLE, np.eye(3), together.C_i, together)
     for item in items:
-        found = contact(*snapshots(joint), True, [item], True, options("jacobian"))
+        found = contact(*snapshots(joint), True, [item], UNICYCLE, True, options("jacobian"))
         after = joint.copy()
         for side, C in enumerate((found.C_i, found.C_j)):
             part = slice(3 * side, 3 * side + 3)

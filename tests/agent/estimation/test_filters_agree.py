@@ -60,7 +60,7 @@ def test_a_linear_problem_gives_the_kalman_filter(transform: Transform) -> None:
 
 def test_the_unscented_update_is_the_librarys() -> None:
     """Range and bearing to a landmark, sigma points of the same spread and weights."""
-    model = RelativeModel("range_bearing", 3, landmark=(8.0, 3.0))
+    model = RelativeModel("range_bearing", UNICYCLE, landmark=(8.0, 3.0))
     mean, cov = np.array([1.0, 2.0, 0.3]), np.array([[0.5, 0.1, 0.0], [0.1, 0.4, 0.02], [0.0, 0.02, 0.05]])
     R, z = np.diag([0.04, 0.01]), np.array([7.3, -0.2])
     points = MerweScaledSigmaPoints(3, alpha=1.0, beta=0.0, kappa=0.0)
@@ -91,7 +91,7 @@ def test_batches_equal_single_calls() -> None:
     means = rng.normal(size=(5, 3))
     roots = rng.normal(size=(5, 3, 3))
     covs = roots @ roots.swapaxes(-1, -2) * 0.05 + 0.01 * np.eye(3)
-    model = RelativeModel("range_bearing", 3, mount=(0.2, -0.1, 0.4), landmark=(4.0, 9.0))
+    model = RelativeModel("range_bearing", UNICYCLE, mount=(0.2, -0.1, 0.4), landmark=(4.0, 9.0))
     for transform in TRANSFORMS:
         batch = observe(model.h, model.jacobian, means, covs, model.angles, transform)
         for k in range(5):
@@ -99,7 +99,7 @@ def test_batches_equal_single_calls() -> None:
             assert np.allclose(batch.z[k], single.z)
             assert np.allclose(batch.cov[k], single.cov)
             assert np.allclose(batch.cross[k], single.cross)
-    pose = AbsoluteModel("pose", 3)
+    pose = AbsoluteModel("pose", UNICYCLE)
     assert np.allclose(pose.h(means), means)
 
 
@@ -107,7 +107,7 @@ def test_the_unscented_residual_is_not_negative() -> None:
     rng = np.random.default_rng(1)
     for _ in range(50):
         root = rng.normal(size=(6, 6))
-        model = RelativeModel(("range", "bearing", "range_bearing")[rng.integers(3)], 3)
+        model = RelativeModel(("range", "bearing", "range_bearing")[rng.integers(3)], UNICYCLE)
         mean = rng.normal(size=6) * 5
         predicted = observe(model.h, model.jacobian, mean, root @ root.T * 0.02 + np.eye(6) * 1e-3, model.angles)
         assert np.linalg.eigvalsh(predicted.residual).min() > -1e-12

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian import wrap, wrap_components
+from agent.estimation.motion import CONSTANT_VELOCITY, UNICYCLE, StateLayout
 from agent.estimation.observation import ABSOLUTE, RELATIVE_ANGLES, AbsoluteModel, RelativeModel
 
 Array = NDArray[np.float64]
@@ -45,9 +46,9 @@ def test_the_jacobian_of_a_relative_measurement_is_the_finite_difference(
     rest: int,
 ) -> None:
     """Of a peer or target with `rest` more components, which it doesn't depend on."""
-    model = RelativeModel(kind, 3, mount)
+    model = RelativeModel(kind, UNICYCLE, mount)
     state = np.concatenate([[x, y, heading, east, north], np.full(rest, 0.7)])
-    assume(float(RelativeModel("range", 3, mount).h(state)[0]) > 0.5)
+    assume(float(RelativeModel("range", UNICYCLE, mount).h(state)[0]) > 0.5)
     found = model.jacobian(state)
     assert found.shape == (len(model.h(state)), 5 + rest)
     assert np.allclose(found, central_difference(model, state), atol=1e-6)
@@ -59,8 +60,8 @@ def test_a_landmark_is_a_subject_without_columns(
     kind: str, mount: tuple[float, float, float], x: float, y: float, heading: float, east: float, north: float
 ) -> None:
     observer, stacked = np.array([x, y, heading]), np.array([x, y, heading, east, north])
-    fixed, free = RelativeModel(kind, 3, mount, (east, north)), RelativeModel(kind, 3, mount)
-    assume(float(RelativeModel("range", 3, mount).h(stacked)[0]) > 0.5)
+    fixed, free = RelativeModel(kind, UNICYCLE, mount, (east, north)), RelativeModel(kind, UNICYCLE, mount)
+    assume(float(RelativeModel("range", UNICYCLE, mount).h(stacked)[0]) > 0.5)
     assert np.array_equal(fixed.h(observer), free.h(stacked))
     assert np.array_equal(fixed.jacobian(observer), free.jacobian(stacked)[:, :3])
     assert np.allclose(fixed.jacobian(observer), central_difference(fixed, observer), atol=1e-6)
@@ -78,7 +79,7 @@ def test_what_is_seen_does_not_depend_on_the_frame(
     shift_y: float,
     turn: float,
 ) -> None:
-    model = RelativeModel("range_bearing", 3, mount)
+    model = RelativeModel("range_bearing", UNICYCLE, mount)
     here = np.array([x, y, heading, east, north])
     cos, sin = math.cos(turn), math.sin(turn)
     rotation, shift = np.array([[cos, -sin], [sin, cos]]), np.array([shift_x, shift_y])
@@ -109,15 +110,15 @@ def test_known_ranges_and_bearings(
     state: list[float], mount: tuple[float, float, float], distance: float, bearing: float
 ) -> None:
     at = np.array(state)
-    assert np.allclose(RelativeModel("range_bearing", 3, mount).h(at), [distance, bearing])
-    assert np.allclose(RelativeModel("range", 3, mount).h(at), [distance])
-    assert np.allclose(RelativeModel("bearing", 3, mount).h(at), [bearing])
+    assert np.allclose(RelativeModel("range_bearing", UNICYCLE, mount).h(at), [distance, bearing])
+    assert np.allclose(RelativeModel("range", UNICYCLE, mount).h(at), [distance])
+    assert np.allclose(RelativeModel("bearing", UNICYCLE, mount).h(at), [bearing])
 
 
 def test_bearings_are_wrapped_whatever_the_heading() -> None:
     headings = np.linspace(-9.0, 9.0, 181)
     states = np.column_stack([np.zeros((181, 2)), headings, np.full(181, -4.0), np.full(181, 0.5)])
-    bearings = RelativeModel("bearing", 3, (0.0, 0.0, 2.5)).h(states)
+    bearings = RelativeModel("bearing", UNICYCLE, (0.0, 0.0, 2.5)).h(states)
     assert bearings.shape == (181, 1)
     assert np.all(bearings > -math.pi)
     assert np.all(bearings <= math.pi)
@@ -126,20 +127,20 @@ def test_bearings_are_wrapped_whatever_the_heading() -> None:
 
 @pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (0.3, 0.1)])
 def test_a_range_depends_on_the_heading_through_the_lever_arm_alone(x: float, y: float) -> None:
-    jacobian = RelativeModel("range", 3, (x, y, 0.0)).jacobian(np.array([0.0, 0.0, 0.4, 5.0, 7.0]))
+    jacobian = RelativeModel("range", UNICYCLE, (x, y, 0.0)).jacobian(np.array([0.0, 0.0, 0.4, 5.0, 7.0]))
     assert bool(jacobian[0, 2]) == bool(x or y)
 
 
 def test_a_range_needs_no_heading() -> None:
     """Of an observer whose third component is a velocity."""
-    model, state = RelativeModel("range", 4), np.array([0.0, 0.0, 9.0, 9.0, 3.0, 4.0, 0.0])
+    model, state = RelativeModel("range", CONSTANT_VELOCITY), np.array([0.0, 0.0, 9.0, 9.0, 3.0, 4.0, 0.0])
     assert np.allclose(model.h(state), [5.0])
     assert np.allclose(model.jacobian(state), [[-0.6, -0.8, 0.0, 0.0, 0.6, 0.8, 0.0]])
 
 
 def test_derivatives_are_finite_at_the_sensor_itself() -> None:
     state = np.array([1.0, 2.0, 0.3, 1.0, 2.0])
-    model = RelativeModel("range_bearing", 3)
+    model = RelativeModel("range_bearing", UNICYCLE)
     assert np.all(np.isfinite(model.h(state)))
     assert np.all(np.isfinite(model.jacobian(state)))
 
@@ -149,7 +150,7 @@ def test_derivatives_of_many_states_are_those_of_each() -> None:
     states = rng.normal(size=(3, 2, 6)) * 4.0
     for kind in RELATIVE_ANGLES:
         for landmark in (None, (20.0, 3.0)):
-            model = RelativeModel(kind, 3, (0.3, -0.2, 0.5), landmark)
+            model = RelativeModel(kind, UNICYCLE, (0.3, -0.2, 0.5), landmark)
             at = states if landmark is None else states[..., :3]
             batch = model.jacobian(at)
             for index in np.ndindex(3, 2):
@@ -161,7 +162,8 @@ def test_derivatives_of_many_states_are_those_of_each() -> None:
 @pytest.mark.parametrize("dim", [3, 4])
 def test_absolute_information_selects_components(kind: str, dim: int) -> None:
     components, angles = ABSOLUTE[kind]
-    model, state = AbsoluteModel(kind, dim), np.array([5.0, -6.0, 0.7, 0.1])[:dim]
+    layout = StateLayout("pose and more", dim, (2,), 2)
+    model, state = AbsoluteModel(kind, layout), np.array([5.0, -6.0, 0.7, 0.1])[:dim]
     assert model.h(state).tolist() == [state[index] for index in components]
     assert np.array_equal(model.jacobian(state), np.eye(dim)[list(components)])
     assert model.jacobian(np.stack([state, state])).shape == (2, len(components), dim)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian import gain, square_root
-from agent.estimation.motion import compose
+from agent.estimation.motion import UNICYCLE, compose
 from agent.estimation.observation import RelativeModel
 from agent.estimation.unscented import (
     DEFAULT,
@@ -108,7 +108,7 @@ def test_the_transforms_differ_in_the_second_order_alone() -> None:
 @given(SEED, st.sampled_from(["range", "bearing", "range_bearing"]))
 def test_the_residual_is_a_covariance_and_grows_with_the_belief(seed: int, kind: str) -> None:
     rng = np.random.default_rng(seed)
-    model = RelativeModel(kind, 3, (0.2, 0.1, 0.3))
+    model = RelativeModel(kind, UNICYCLE, (0.2, 0.1, 0.3))
     mean = np.concatenate([rng.uniform(-2.0, 2.0, size=3), rng.uniform(5.0, 9.0, size=2), [0.0]])
     cov = random_covariance(rng, 6) * 0.02
     found = observe(model.h, model.jacobian, mean, cov, model.angles)
@@ -121,7 +121,7 @@ def test_headings_and_bearings_across_the_half_turn_average_to_it() -> None:
     turned = propagate(compose_noise, np.array([0.0, 0.0, 3.1]), np.diag([0.01, 0.01, 0.04]), np.zeros((3, 0)), (2,))
     assert float(turned.mean[2]) == pytest.approx(3.1 + 0.1 - 2.0 * math.pi)
     assert float(turned.cov[2, 2]) == pytest.approx(0.04)
-    behind = RelativeModel("bearing", 3, landmark=(-5.0, 0.0))
+    behind = RelativeModel("bearing", UNICYCLE, landmark=(-5.0, 0.0))
     found = observe(behind.h, behind.jacobian, np.zeros(3), np.diag([0.01, 0.2, 0.04]), behind.angles)
     assert abs(abs(float(found.z[0])) - math.pi) < 1e-6
     assert float(found.cov[0, 0]) == pytest.approx(0.04 + 0.2 / 25.0, rel=0.02)
@@ -136,7 +136,7 @@ def test_leading_axes_are_a_loop() -> None:
     rng = np.random.default_rng(6)
     means, covs = rng.normal(size=(2, 3, 3)), random_covariance(rng, 2, 3, 3) * 0.1
     Q = square_root(np.diag([0.01, 0.02, 0.03]))
-    model = RelativeModel("range_bearing", 3, (0.2, -0.1, 0.4), (4.0, 9.0))
+    model = RelativeModel("range_bearing", UNICYCLE, (0.2, -0.1, 0.4), (4.0, 9.0))
 
     def move(x: Array, w: Array) -> Array:
         return compose(x, np.array([0.5, 0.1, 0.3]) + w)
@@ -159,7 +159,7 @@ def test_leading_axes_are_a_loop() -> None:
 
 def test_the_arguments_are_left_alone() -> None:
     mean, cov = np.array([0.0, 0.0, 3.1]), np.diag([0.01, 0.01, 0.04])
-    model = RelativeModel("bearing", 3, landmark=(-5.0, 0.0))
+    model = RelativeModel("bearing", UNICYCLE, landmark=(-5.0, 0.0))
     propagate(compose_noise, mean, cov, np.zeros((3, 0)), (2,))
     for transform in TRANSFORMS:
         observe(model.h, model.jacobian, mean, cov, model.angles, transform)
@@ -172,7 +172,7 @@ def test_fifty_steps_agree_with_a_public_filter(parameters: tuple[float, float, 
     """Range and bearing to a landmark ahead. filterpy reuses the predicted points; here, as there, they are redrawn."""
     rng = np.random.default_rng(17)
     alpha, beta, kappa = parameters
-    model = RelativeModel("range_bearing", 3, landmark=(40.0, 5.0))
+    model = RelativeModel("range_bearing", UNICYCLE, landmark=(40.0, 5.0))
     Q, R = np.diag([0.01, 0.01, 1e-4]), np.diag([0.04, 0.001])
     mean, cov = np.array([0.0, 0.0, 0.1]), np.diag([0.3, 0.2, 0.01])
     points = MerweScaledSigmaPoints(3, alpha, beta, kappa)
