@@ -221,9 +221,9 @@ class VirtualEngine:
         if applied == self._applied.get(robot, 0):
             return
         self._applied[robot] = applied
-        for peer, record in sorted(node.agent.state.pairs.items()):
-            if record.base.met and record.base != self._bases.get((robot, peer)):
-                self._bases[robot, peer] = record.base
+        for peer, epoch in sorted(node.agent.filter.contacts().items()):
+            if epoch != self._bases.get((robot, peer)):
+                self._bases[robot, peer] = epoch
                 self.contacts.append((self._now / NS, robot, peer))
 
     def _carry_out(self, robot: str, out: Outgoing) -> None:

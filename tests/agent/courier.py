@@ -104,7 +104,7 @@ class Pair:
 
     def cross(self) -> Array | None:
         """P_12 as the next contact would recover it."""
-        return resolve_cross(self.agents[FIRST].snapshot(SECOND), self.agents[SECOND].snapshot(FIRST))
+        return resolve_cross(self.agents[FIRST].filter.snapshot(SECOND), self.agents[SECOND].filter.snapshot(FIRST))
 
 
 class Ledger:

@@ -58,9 +58,9 @@ def fed(subject: Agent, *events: Event) -> Agent:
 
 
 def assert_same_belief(one: Agent, other: Agent, tolerance: float) -> None:
-    assert one.state.t_ns == other.state.t_ns
-    assert np.abs(one.state.mean - other.state.mean).max() <= tolerance
-    assert np.abs(one.state.cov - other.state.cov).max() <= tolerance
+    assert one.filter.state.t_ns == other.filter.state.t_ns
+    assert np.abs(one.filter.state.mean - other.filter.state.mean).max() <= tolerance
+    assert np.abs(one.filter.state.cov - other.filter.state.cov).max() <= tolerance
 
 
 def test_odometry_is_cut_at_a_measurement() -> None:
@@ -100,8 +100,8 @@ def test_late_data_never_claim_more_than_timely_ones() -> None:
     drives = [odometry(k * NS, (k + 1) * NS) for k in range(4)]
     timely = fed(agent(), drives[0], position(NS, NS), drives[1], landmark(2 * NS, 2 * NS), *drives[2:])
     late = fed(agent(), drives[0], drives[1], landmark(2 * NS, 2 * NS), *drives[2:], position(NS, 4 * NS))
-    assert np.linalg.eigvalsh(late.state.cov - timely.state.cov).min() > -1e-3
-    assert np.trace(late.state.cov) >= np.trace(timely.state.cov) - 1e-9
+    assert np.linalg.eigvalsh(late.filter.state.cov - timely.filter.state.cov).min() > -1e-3
+    assert np.trace(late.filter.state.cov) >= np.trace(timely.filter.state.cov) - 1e-9
 
 
 def test_late_data_are_dropped_when_told_so_or_too_old() -> None:
@@ -114,21 +114,21 @@ def test_late_data_are_dropped_when_told_so_or_too_old() -> None:
 
 def test_a_gap_in_odometry_is_coasted_with_growing_covariance() -> None:
     subject = fed(agent(), odometry(0, NS))
-    before = subject.state.cov
+    before = subject.filter.state.cov
     fed(subject, odometry(3 * NS, 4 * NS))
     assert subject.counters["odometry.coasted"] == 1
-    assert subject.state.t_ns == 4 * NS
+    assert subject.filter.state.t_ns == 4 * NS
     # Two seconds at the coasting speed of 0.5 m/s and 0.5 rad/s, one sigma.
-    assert subject.state.cov[0, 0] > before[0, 0] + 0.99
-    assert subject.state.cov[2, 2] > before[2, 2] + 0.99
+    assert subject.filter.state.cov[0, 0] > before[0, 0] + 0.99
+    assert subject.filter.state.cov[2, 2] > before[2, 2] + 0.99
 
 
 def test_data_wait_for_odometry_and_then_coast() -> None:
     subject = fed(agent(odometry_wait_ns=NS), position(NS, NS))
-    assert subject.state.t_ns == 0
+    assert subject.filter.state.t_ns == 0
     assert subject.next_deadline_ns() == 2 * NS
     fed(subject, Tick(2 * NS))
-    assert subject.state.t_ns == NS
+    assert subject.filter.state.t_ns == NS
     assert subject.counters["used.position"] == 1
 
 
@@ -144,7 +144,8 @@ def test_any_order_of_arrival_gives_the_same_estimate() -> None:
     for arrival in permutations(inputs):
         subject = fed(agent(settle_ns=NS // 2), *arrival, Tick(2 * NS))
         assert subject.counters["used.position"] == subject.counters["used.heading"] == 1
-        results.add((subject.state.t_ns, subject.state.mean.tobytes(), subject.state.cov.tobytes()))
+        state = subject.filter.state
+        results.add((state.t_ns, state.mean.tobytes(), state.cov.tobytes()))
     assert len(results) == 1
 
 
@@ -173,10 +174,10 @@ def test_equal_events_give_equal_effects() -> None:
 )
 def test_what_is_not_used_is_counted(event: Event, counter: str) -> None:
     subject = fed(agent(), odometry(0, NS))
-    before = subject.state
+    before = subject.filter.state
     subject.handle(event)
     assert subject.counters[counter] == 1
-    assert subject.state.mean is before.mean
+    assert subject.filter.state.mean is before.mean
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 0, 2)])
@@ -200,7 +201,7 @@ def test_buffers_are_bounded() -> None:
     subject = agent(horizon_ns=3 * NS)
     for k in range(20):
         fed(subject, odometry(k * NS, (k + 1) * NS))
-    assert len(subject.history) <= 5
+    assert len(subject.filter.history) <= 5
     for _ in range(2000):
         fed(subject, landmark(22 * NS, 20 * NS))
     assert subject.counters["input.overflow"] > 1000
@@ -234,7 +235,7 @@ def test_no_order_of_stamps_stalls_the_core(
             subject.handle(landmark(t_ns, now_ns))
         else:
             subject.handle(Tick(now_ns))
-        assert subject.state.t_ns >= reached
-        reached = subject.state.t_ns
+        assert subject.filter.state.t_ns >= reached
+        reached = subject.filter.state.t_ns
         assert subject.next_deadline_ns() >= subject.now_ns
-        np.linalg.cholesky(subject.state.cov)
+        np.linalg.cholesky(subject.filter.state.cov)

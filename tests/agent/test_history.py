@@ -71,7 +71,7 @@ def test_data_late_in_their_order_give_the_timely_result(quarters: set[int], wai
     timely = played(Agent(replace(plain(), lateness=settling)), drives + [fix(t_ns, t_ns) for t_ns in stamps])
     timely.handle(Tick(50 * STEP))
     assert late.counters["used.position"] == timely.counters["used.position"] == len(stamps)
-    assert_same(late.state, timely.state, 1e-9)
+    assert_same(late.filter.state, timely.filter.state, 1e-9)
 
 
 ARRIVALS = st.lists(st.tuples(st.integers(1, 5), st.integers(0, 5)), min_size=1, max_size=4)
@@ -106,14 +106,14 @@ def test_the_covariance_is_that_of_the_errors_whatever_the_order(arrivals: list[
 
     still = run(True, -1, 0, 0.0)
     response = [
-        run(True, noisy, column, 1e3).state.mean[:2] - run(True, noisy, column, -1e3).state.mean[:2]
+        run(True, noisy, column, 1e3).estimate().mean[:2] - run(True, noisy, column, -1e3).estimate().mean[:2]
         for noisy in range(7 + len(arrivals))
         for column in (0, 1)
     ]
     errors = np.stack(response, axis=1) / 2e3
-    assert np.abs(still.state.cov[:2, :2] - errors @ errors.T).max() < 1e-7
-    timely = run(False, -1, 0, 0.0).state.cov
-    assert np.linalg.eigvalsh(still.state.cov - timely).min() > -1e-12
+    assert np.abs(still.filter.state.cov[:2, :2] - errors @ errors.T).max() < 1e-7
+    timely = run(False, -1, 0, 0.0).filter.state.cov
+    assert np.linalg.eigvalsh(still.filter.state.cov - timely).min() > -1e-12
 
 
 @pytest.mark.parametrize("late_steps", [0, 3, 10, 20])
@@ -140,8 +140,8 @@ def test_a_stream_of_late_fixes_stays_honest(late_steps: int) -> None:
                 z = truth[then][:2] + rng.normal(size=2) * 0.1
                 subject.handle(Fix((k + 1) * STEP, then * STEP, "position", z, 0.01 * np.eye(2), "gps"))
             if k >= 50 and k % 10 == 0:
-                error = subject.state.mean[:2] - truth[-1][:2]
-                nees += float(error @ np.linalg.solve(subject.state.cov[:2, :2], error)) / 2.0
+                error = subject.filter.state.mean[:2] - truth[-1][:2]
+                nees += float(error @ np.linalg.solve(subject.filter.state.cov[:2, :2], error)) / 2.0
                 used += 1
         assert subject.counters["late.compensated"] == (200 - late_steps if late_steps else 0)
     assert 0.6 < nees / used < 1.4
@@ -174,7 +174,7 @@ def test_late_data_between_contacts_leave_the_correlation_exact() -> None:
     timely, late = story(late=False), story(late=True)
     assert late.agents[FIRST].counters["late.compensated"] == 3
     for name in (FIRST, SECOND):
-        assert_same(late.agents[name].state, timely.agents[name].state, 1e-9)
+        assert_same(late.agents[name].filter.state, timely.agents[name].filter.state, 1e-9)
     cross, reference = late.cross(), timely.cross()
     assert cross is not None
     assert reference is not None
@@ -189,11 +189,11 @@ def test_data_older_than_a_contact_move_its_line_as_the_own_error() -> None:
         for name in (FIRST, SECOND):
             pair.odometry(name, k * NS, (k + 1) * NS, np.array([0.3, 0.1, 0.0, 0.0]), NOISE)
     (request,) = pair.measure(FIRST, 3 * NS, "range", np.array([6.4]), np.array([[0.01]]))
-    before = pair.agents[FIRST].state.cov
+    before = pair.agents[FIRST].filter.state.cov
     pair.odometry(FIRST, 3 * NS, 4 * NS, np.array([0.3, 0.1, 0.0, 0.0]), NOISE)
     pair.agents[FIRST].handle(fix(NS, pair.now_ns))
-    then, psi = since(pair.agents[FIRST].history, 3 * NS)
-    (line,) = pair.agents[FIRST].snapshot(SECOND).lines
+    then, psi = since(pair.agents[FIRST].filter.history, 3 * NS)
+    (line,) = pair.agents[FIRST].filter.snapshot(SECOND).lines
     assert line.epoch == request.body.epoch
     assert np.abs(line.matrix - psi @ then.cov @ np.linalg.inv(before)).max() < 1e-6
     assert np.trace(then.cov) < np.trace(before)
@@ -201,13 +201,13 @@ def test_data_older_than_a_contact_move_its_line_as_the_own_error() -> None:
 
 def test_a_correction_that_would_leave_a_covariance_indefinite_changes_nothing() -> None:
     subject = played(Agent(plain()), [drive(k) for k in range(4)])
-    then = subject.history.cut(2 * STEP)
+    then = subject.filter.history.cut(2 * STEP)
     assert then is not None
-    state = subject.state
+    state = subject.filter.state
     impossible = Update(then.mean, -3.0 * then.cov, np.eye(3), 1.0)
-    assert subject.history.corrected(then.t_ns, impossible) is None
-    assert subject.history.cut(2 * STEP) is then
-    assert subject.state is state
+    assert subject.filter.history.corrected(then.t_ns, impossible) is None
+    assert subject.filter.history.cut(2 * STEP) is then
+    assert subject.filter.state is state
 
 
 def since(history: History, t_ns: int) -> tuple[RobotState, Array]:
@@ -236,13 +236,13 @@ def test_the_past_is_told_with_the_factors_since() -> None:
     base = plain(np.diag([0.3, 0.2, 0.05]))
     subject = played(Agent(base), [drive(0), fix(STEP, STEP), drive(1), fix(2 * STEP, 2 * STEP), drive(2)])
     for t_ns in (0, STEP // 2, STEP, 3 * STEP // 2, 2 * STEP, 3 * STEP):
-        then, psi = since(subject.history, t_ns)
+        then, psi = since(subject.filter.history, t_ns)
         assert then.t_ns == t_ns
         # What is left of P is noise since then: P - Psi P_k Psi^T >= 0, and zero at the present.
-        assert np.linalg.eigvalsh(subject.state.cov - psi @ then.cov @ psi.T).min() > -1e-12
+        assert np.linalg.eigvalsh(subject.filter.state.cov - psi @ then.cov @ psi.T).min() > -1e-12
     assert np.array_equal(psi, np.eye(3))
-    assert subject.history.cut(-1) is None
-    assert subject.history.cut(3 * STEP + 1) is None
+    assert subject.filter.history.cut(-1) is None
+    assert subject.filter.history.cut(3 * STEP + 1) is None
 
 
 def test_a_cut_past_is_the_same_past() -> None:
@@ -282,4 +282,4 @@ def test_a_late_landmark_is_used_like_a_late_fix() -> None:
     timely = played(Agent(base), [*(drive(k) for k in range(6)), replace(seen[0], t_ns=2 * STEP)])
     late = played(Agent(base), [*(drive(k) for k in range(6)), replace(seen[1], t_ns=6 * STEP)])
     assert late.counters["late.compensated"] == 1
-    assert_same(late.state, timely.state, 1e-9)
+    assert_same(late.filter.state, timely.filter.state, 1e-9)

@@ -122,10 +122,11 @@ def test_overlapping_contacts_and_late_fixes_claim_their_true_covariance() -> No
     columns = []
     for source in sources:
         for column in (0, 1):
-            ahead, behind = (overlapping(source, column, sign * SIZE).agents["r1"].state.mean for sign in (1.0, -1.0))
+            fleets = [overlapping(source, column, sign * SIZE) for sign in (1.0, -1.0)]
+            ahead, behind = (fleet.agents["r1"].filter.state.mean for fleet in fleets)
             columns.append((ahead - behind)[:2] / (2.0 * SIZE))
     errors = np.stack(columns, axis=1)
-    assert np.abs(still.state.cov[:2, :2] - errors @ errors.T).max() < 1e-4
+    assert np.abs(still.filter.state.cov[:2, :2] - errors @ errors.T).max() < 1e-4
 
 
 def test_a_dense_fleet_far_behind_stays_where_it_is() -> None:
@@ -158,8 +159,8 @@ def test_a_dense_fleet_far_behind_stays_where_it_is() -> None:
             for peer in names[index + 1 :]:
                 z = np.array([np.hypot(*(truth[peer] - truth[name])[:2]) + rng.normal() * 0.1])
                 fleet.handle(name, Observation(now_ns, now_ns, "range", peer, z, np.eye(1) * 0.01, "range"))
-        squares += [float(np.sum((fleet.agents[name].state.mean - truth[name])[:2] ** 2)) for name in names]
+        squares += [float(np.sum((fleet.agents[name].filter.state.mean - truth[name])[:2] ** 2)) for name in names]
     assert sum(agent.counters["pair.applied_initiator"] for agent in fleet.agents.values()) > 400
     assert np.sqrt(np.mean(squares)) < 1.5
     for agent in fleet.agents.values():
-        np.linalg.cholesky(agent.state.cov)
+        np.linalg.cholesky(agent.filter.state.cov)

@@ -62,7 +62,7 @@ class Story:
         letters = []
         for name, agent in self.pair.agents.items():
             delta = np.array([0.3, 0.1, 0.0, 0.0])
-            self.ledger.moved(name, float(agent.state.mean[2]), delta, NOISE)
+            self.ledger.moved(name, float(agent.filter.state.mean[2]), delta, NOISE)
             letters += self.pair.odometry(name, (self.k - 1) * NS, self.k * NS, delta, NOISE)
         return letters
 
@@ -71,7 +71,7 @@ class Story:
         self.ledger.mark(self.k * NS)
         letters = []
         for name in who:
-            own, other = self.pair.agents[name].state.mean, self.pair.agents[OTHER[name]].state.mean
+            own, other = self.pair.agents[name].filter.state.mean, self.pair.agents[OTHER[name]].filter.state.mean
             z = RelativeModel("range_bearing", UNICYCLE).h(np.concatenate([own, other])) + np.array([0.05, -0.02])
             letters += self.pair.measure(name, self.k * NS, "range_bearing", z, R)
         self.travel(letters)
@@ -102,12 +102,12 @@ class Story:
         if isinstance(letter.body, PairRequest):
             self.requests[letter.body.epoch] = letter.body
         robot, peer = letter.destination, letter.source
-        before = self.pair.agents[robot].state.pair(peer).base
+        before = self.pair.agents[robot].filter.state.pair(peer).base
         answers = self.pair.deliver(letter)
         for reply in (*answers, letter):
             if isinstance(reply.body, PairReply) and reply.body.snapshot is not None:
                 self.replies[reply.body.epoch] = reply.body
-        after = self.pair.agents[robot].state.pair(peer).base
+        after = self.pair.agents[robot].filter.state.pair(peer).base
         if after != before and after.met:
             request, reply_body = self.requests[after], self.replies[after]
             own_initiated = after.initiator == robot
@@ -116,7 +116,7 @@ class Story:
             if self._anew:
                 # What is claimed is a bound only; the gain follows from the claim.
                 cross = claimed_cross(request, reply_body, after.initiator)
-            psi = self.pair.agents[robot].snapshot(peer).line
+            psi = self.pair.agents[robot].filter.snapshot(peer).line
             K, H_i, H_j, noise = gains_of(request, reply_body, psi, own_initiated, cross)
             self.ledger.applied(robot, request, K, H_i, H_j, noise)
             self.applied.append((after, robot))
@@ -124,7 +124,7 @@ class Story:
 
     def restart(self, robot: str) -> None:
         """`robot` comes back without its factors, told from its old estimate; its own covariance is doubled."""
-        old = self.pair.agents[robot].state
+        old = self.pair.agents[robot].filter.state
         fresh = Pair({FIRST: (old.mean, 2.0 * old.cov), SECOND: (old.mean, 2.0 * old.cov)}, timeout_s=1000.0)
         agent = fresh.agents[robot]
         agent.handle(Tick(self.k * NS))
@@ -140,8 +140,9 @@ class Story:
         Its belief is the old one with twice the covariance (`kept`), or one that owes nothing to anybody.
         """
         old = self.pair.agents[robot]
-        cov = 2.0 * old.state.cov if kept else STARTS[robot][1]
-        self.pair.agents[robot] = Agent(replace(old.settings, start_ns=self.k * NS, mean=old.state.mean, cov=cov))
+        cov = 2.0 * old.filter.state.cov if kept else STARTS[robot][1]
+        settings = replace(old.settings, start_ns=self.k * NS, mean=old.filter.state.mean, cov=cov)
+        self.pair.agents[robot] = Agent(settings)
         self.pair.lives[robot] += 1
         if not kept:
             self.ledger.begin_anew(robot, STARTS[robot][1])
@@ -183,9 +184,9 @@ def run(fates: tuple[str, ...], first: str, second: str) -> Story:
 
 def assert_books_exact(story: Story, note: str) -> None:
     for name, agent in story.pair.agents.items():
-        difference = np.abs(agent.state.cov - story.ledger.cov(name, name)).max()
+        difference = np.abs(agent.filter.state.cov - story.ledger.cov(name, name)).max()
         assert difference < 1e-9, f"{note}: covariance of {name} is off by {difference:.2e}"
-        np.linalg.cholesky(agent.state.cov)
+        np.linalg.cholesky(agent.filter.state.cov)
     assert len(set(story.applied)) == len(story.applied), f"{note}: a contact was applied twice by one side"
     cross = story.pair.cross()
     assert cross is not None, f"{note}: the correlation was lost"
@@ -219,8 +220,8 @@ def test_after_a_restart_claims_bound_the_truth(first: str, robot: str) -> None:
         assert cross is not None
         claimed = np.block(
             [
-                [story.pair.agents[FIRST].state.cov, cross],
-                [cross.T, story.pair.agents[SECOND].state.cov],
+                [story.pair.agents[FIRST].filter.state.cov, cross],
+                [cross.T, story.pair.agents[SECOND].filter.state.cov],
             ]
         )
         true = np.block([[story.ledger.cov(a, b) for b in (FIRST, SECOND)] for a in (FIRST, SECOND)])
@@ -261,7 +262,7 @@ def test_whatever_arrives_around_a_new_life_claims_bound_the_truth(
             story.contact((OTHER[again],))
             story.learn()
             assert len(set(story.applied)) == len(story.applied), note
-            low, high = (story.pair.agents[name].state.cov for name in (FIRST, SECOND))
+            low, high = (story.pair.agents[name].filter.state.cov for name in (FIRST, SECOND))
             cross = story.pair.cross()
             assert cross is not None, note
             claimed = np.block([[low, cross], [cross.T, high]])
@@ -284,7 +285,7 @@ def test_an_instant_that_has_left_the_ring_is_answered_too_old() -> None:
     story.late()
     assert responder_counters(story)["pair.too_old"] == 1
     assert story.pair.agents[FIRST].counters["pair.answer_too_old"] == 1
-    assert story.pair.agents[FIRST].state.pair(SECOND).lines == ()
+    assert story.pair.agents[FIRST].filter.state.pair(SECOND).lines == ()
     assert story.applied == []
     story.contact(WHO["first"])
     assert len(story.applied) == 2

@@ -86,35 +86,35 @@ def test_no_snapshot_stops_the_agent(snapshot: Snapshot, kind: str, epoch: Epoch
     z = np.array([5.0, 0.1])[: 2 if kind == "range_bearing" else 1]
     subject.handle(told(PairRequest(epoch, (Measurement(kind, z, np.eye(len(z)) * 0.01),), snapshot)))
     subject.handle(told(PairReply(epoch, ReplyStatus.OK, snapshot), 10))
-    np.linalg.cholesky(subject.state.cov)
-    assert np.all(np.isfinite(subject.state.mean))
+    np.linalg.cholesky(subject.filter.state.cov)
+    assert np.all(np.isfinite(subject.filter.state.mean))
 
 
 @pytest.mark.parametrize("shape", [(3, 0), (3, 4), (1, 1)])
 def test_a_factor_of_the_wrong_size_is_counted_and_changes_nothing(shape: tuple[int, int]) -> None:
     pair = met_pair()
     subject, peer = pair.agents[FIRST], pair.agents[SECOND]
-    wrong = replace(peer.snapshot(FIRST), factor=np.ones(shape))
-    before = subject.state
+    wrong = replace(peer.filter.snapshot(FIRST), factor=np.ones(shape))
+    before = subject.filter.state
     item = Measurement("bearing", np.array([0.2]), np.array([[0.01]]))
     subject.handle(told(PairRequest(Epoch(2 * NS, SECOND, 1), (item,), wrong)))
     assert subject.counters["pair.malformed"] == 1
-    assert subject.state is before
+    assert subject.filter.state is before
 
 
 def test_an_unknown_correlation_doubles_the_covariance_once_and_the_pair_goes_on() -> None:
     """One side has lost its factors: neither uses that contact, both double their own, the next one works."""
     pair = met_pair(until_s=1)
     lost = pair.agents[SECOND].settings
-    pair.agents[SECOND] = Agent(replace(lost, start_ns=NS, mean=pair.agents[SECOND].state.mean))
+    pair.agents[SECOND] = Agent(replace(lost, start_ns=NS, mean=pair.agents[SECOND].filter.state.mean))
     for name in STARTS:
         pair.odometry(name, NS, 2 * NS, np.array([0.3, 0.0, 0.0, 0.1]), NOISE)
-    before = {name: agent.state.cov for name, agent in pair.agents.items()}
+    before = {name: agent.filter.state.cov for name, agent in pair.agents.items()}
     pair.converse(pair.measure(FIRST, 2 * NS, "range", np.array([6.1]), np.array([[0.01]])))
     for name, agent in pair.agents.items():
         assert agent.counters["pair.fallback"] == 1
-        assert np.array_equal(agent.state.cov, 2.0 * before[name])
-        assert not agent.state.pair(SECOND if name == FIRST else FIRST).base.met
+        assert np.array_equal(agent.filter.state.cov, 2.0 * before[name])
+        assert not agent.filter.state.pair(SECOND if name == FIRST else FIRST).base.met
     for name in STARTS:
         pair.odometry(name, 2 * NS, 3 * NS, np.array([0.3, 0.0, 0.0, 0.1]), NOISE)
     pair.converse(pair.measure(FIRST, 3 * NS, "range", np.array([6.1]), np.array([[0.01]])))
@@ -133,12 +133,13 @@ def test_a_peer_that_keeps_restarting_cannot_inflate_us_without_limit() -> None:
         subject.handle(LinkChange(NS, SECOND, True, life, life))
         epoch = Epoch(NS, SECOND, life)
         item = Measurement("bearing", np.array([0.2]), np.array([[0.01]]))
-        peer = pair.agents[SECOND].snapshot(FIRST)
+        peer = pair.agents[SECOND].filter.snapshot(FIRST)
         fresh = replace(peer, base=Epoch(), factor=np.zeros((3, 0)), line=np.eye(3), lines=())
         subject.handle(told(PairRequest(epoch, (item,), fresh), life))
     assert subject.counters["pair.restarts"] == 1
     assert subject.counters["pair.restart_refused"] >= 1
-    assert np.trace(subject.state.cov) <= 2.0 * np.trace(STARTS[FIRST][1] + NOISE[np.ix_((0, 1, 3), (0, 1, 3))]) + 0.1
+    planar = NOISE[np.ix_((0, 1, 3), (0, 1, 3))]
+    assert np.trace(subject.filter.state.cov) <= 2.0 * np.trace(STARTS[FIRST][1] + planar) + 0.1
 
 
 def test_a_clock_that_is_off_is_mapped_and_its_doubt_widens_the_noise() -> None:
@@ -182,7 +183,7 @@ def test_many_targets_do_not_silence_a_pair() -> None:
     )
     agents = {}
     for name, agent in pair.agents.items():
-        many = replace(agent.settings, targets=targets, track=True, mean=agent.state.mean, start_ns=NS)
+        many = replace(agent.settings, targets=targets, track=True, mean=agent.filter.state.mean, start_ns=NS)
         agents[name] = Agent(many)
     pair.agents = agents
     (letter,) = pair.measure(FIRST, NS, "range", np.array([6.1]), np.array([[0.01]]))

@@ -60,7 +60,7 @@ class JointFilter:
 def assert_equal(pair: Pair, joint: JointFilter, tolerance: float, note: str) -> None:
     for index, name in enumerate((FIRST, SECOND)):
         part = slice(3 * index, 3 * index + 3)
-        state = pair.agents[name].state
+        state = pair.agents[name].filter.state
         difference = state.mean - joint.x[part]
         difference[2] = wrap(difference[2:])[0]
         scale = max(1.0, float(np.abs(joint.x).max()))
@@ -88,7 +88,7 @@ def test_two_robots_equal_the_joint_filter(seed: int, private: bool) -> None:
             index = int(rng.integers(2))
             name = (FIRST, SECOND)[index]
             R = np.diag([0.3, 0.3, 0.05]) ** 2
-            z = pair.agents[name].state.mean + rng.normal(size=3) * 0.1
+            z = pair.agents[name].filter.state.mean + rng.normal(size=3) * 0.1
             pair.agents[name].handle(Fix(pair.now_ns, t1, "pose", z, R))
             H = np.zeros((3, 6))
             H[:, 3 * index : 3 * index + 3] = np.eye(3)

@@ -1,0 +1,87 @@
+"""What the core needs of a form of cooperative localization.
+
+The core orders events in time and hands them over one by one; a filter holds the estimate and talks to the peers.
+Instants may lie in the past of the filter's own: late data are used or counted, as the form can.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.effects import Effect, Estimate
+from agent.estimation.observation import AbsoluteModel, RelativeModel
+from agent.events import LinkChange, Observation, Received
+from network.messages import Body, Epoch, Measurement
+
+Array = NDArray[np.float64]
+
+
+class CooperativeFilter(Protocol):
+    """One robot's estimator. Nothing here raises on foreign input, except `numpy.linalg.LinAlgError`."""
+
+    @property
+    def t_ns(self) -> int:
+        """Instant of the newest state."""
+        ...
+
+    @property
+    def revision(self) -> object:
+        """An object that is another one whenever the estimate has changed."""
+        ...
+
+    def advance(self, t_ns: int, delta: Array, cov: Array) -> None:
+        """Move the newest state to `t_ns` by an odometry increment (4,) with covariance (4, 4)."""
+        ...
+
+    def absolute(self, t_ns: int, kind: str, model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> None:
+        """Use information about the own state alone; `kind` names it in the figures."""
+        ...
+
+    def sighting(self, t_ns: int, target: str, event: Observation) -> None:
+        """Use a relative measurement of a target."""
+        ...
+
+    def measured(
+        self, peer: str, t_ns: int, now_ns: int, measurements: tuple[Measurement, ...], effects: list[Effect]
+    ) -> None:
+        """A peer was measured: open a contact."""
+        ...
+
+    def instant_ns(self, event: Received) -> int:
+        """The own-clock instant a message of a contact speaks of."""
+        ...
+
+    def requested(self, event: Received, t_ns: int, effects: list[Effect]) -> None:
+        """A peer has opened a contact for the instant `t_ns`."""
+        ...
+
+    def replied(self, peer: str, body: Body) -> None:
+        """A peer has answered."""
+        ...
+
+    def link_changed(self, event: LinkChange) -> None:
+        """A peer appeared, fell silent or began a new life."""
+        ...
+
+    def expire(self, now_ns: int, effects: list[Effect]) -> None:
+        """What has waited too long."""
+        ...
+
+    def deadline_ns(self) -> int:
+        """When `expire` has something to do next."""
+        ...
+
+    def estimate(self) -> Estimate:
+        """The own belief and the tracks at the newest instant."""
+        ...
+
+    def contacts(self) -> dict[str, Epoch]:
+        """The last contact used, by peer."""
+        ...
+
+    def form(self) -> tuple[str, str]:
+        """Name of the form that is on, and why."""
+        ...

@@ -1,0 +1,165 @@
+"""Cooperative localization with one correlation factor per peer (UT-CLAT: Lyu, Pan, Lv 2019; Luft et al. 2018).
+
+The own belief and each target's belief are kept apart; the correlation between them is covered by covariance
+intersection, that between robots by the factors and the pair protocol.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.belief import CorrelationStack, RobotState, TargetState
+from agent.effects import Effect, Estimate, Send, TrackEstimate
+from agent.estimation.colocalization import Options, absolute_update, sighting_update
+from agent.estimation.motion import StateLayout
+from agent.estimation.observation import AbsoluteModel, RelativeModel
+from agent.events import LinkChange, Observation, Received
+from agent.history import History, moved
+from agent.pairs import Pairs
+from agent.settings import AgentSettings
+from network.messages import Body, Epoch, Measurement, PairReply, PairRequest, Snapshot
+
+Array = NDArray[np.float64]
+
+
+class FactorFilter:
+    """The forms `safe` and `published`; see `agent.cooperative_filter` for what each method is given."""
+
+    def __init__(
+        self, settings: AgentSettings, counters: Counter[str], count_nis: Callable[[str, float], None]
+    ) -> None:
+        self._settings, self._counters, self._count_nis = settings, counters, count_nis
+        stack = CorrelationStack(np.zeros((len(settings.mean), 0)))
+        targets = {t.id: TargetState(t.mean, t.cov) for t in settings.targets if settings.track}
+        self.state = RobotState(settings.start_ns, settings.mean, settings.cov, stack, {}, targets)
+        self._target_layouts: dict[str, StateLayout] = {t.id: t.motion.layout for t in settings.targets}
+        self.history = History(settings, self.state)
+        localization = settings.localization
+        self._options = Options(localization.transform, localization.parameters, localization.innovation_cap)
+        self._pairs = Pairs(settings, self._options, counters, count_nis)
+
+    @property
+    def t_ns(self) -> int:
+        return self.state.t_ns
+
+    @property
+    def revision(self) -> object:
+        return self.state
+
+    def advance(self, t_ns: int, delta: Array, cov: Array) -> None:
+        self.state, F = moved(self._settings, self.state, t_ns, delta, cov)
+        self.history.advanced(self.state, delta, cov, F)
+
+    def estimate(self) -> Estimate:
+        state = self.state
+        tracks = tuple(
+            TrackEstimate(name, self._target_layouts[name].name, target.mean, target.cov)
+            for name, target in state.targets.items()
+        )
+        return Estimate(state.t_ns, self._settings.layout.name, state.mean, state.cov, tracks)
+
+    def snapshot(self, peer: str) -> Snapshot:
+        """The present state as it would be told to a peer."""
+        return self._pairs.snapshot(self.state, peer)
+
+    def contacts(self) -> dict[str, Epoch]:
+        return {peer: record.base for peer, record in self.state.pairs.items() if record.base.met}
+
+    def form(self) -> tuple[str, str]:
+        return self._settings.localization.form, "configured"
+
+    # -- own information ------------------------------------------------------------------------------------
+
+    def _late(self, t_ns: int) -> bool:
+        return t_ns < self.state.t_ns - self._settings.lateness.tolerance_ns
+
+    def absolute(self, t_ns: int, kind: str, model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> None:
+        late = self._late(t_ns)
+        then: RobotState | None = self.state
+        if late:
+            then = None if self._settings.lateness.kind == "discard" else self.history.cut(t_ns)
+        if then is None:
+            self._counters["late.dropped"] += 1
+            return
+        update = absolute_update(then.mean, then.cov, self._settings.layout, model, z, R, self._options)
+        state: RobotState | None = None
+        if update is not None and late:
+            state = self.history.corrected(then.t_ns, update)
+        elif update is not None:
+            state = self.state.updated(update.mean, update.cov, update.left)
+            self.history.updated(state, update.left)
+        if update is None or state is None:
+            self._counters["update.not_positive_definite"] += 1
+            return
+        self.state = state
+        if late:
+            self._counters["late.compensated"] += 1
+        self._counters[f"used.{kind}"] += 1
+        self._count_nis(kind, update.nis)
+
+    def sighting(self, t_ns: int, target: str, event: Observation) -> None:
+        belief = self.state.targets.get(target)
+        if belief is None:
+            self._counters["observation.unknown_target"] += 1
+            return
+        if self._late(t_ns):
+            self._counters["late.target_dropped"] += 1
+            return
+        localization = self._settings.localization
+        layout = self._target_layouts[target]
+        own, track, nis = sighting_update(
+            (self.state.mean, self.state.cov, self._settings.layout),
+            (belief.mean, belief.cov, layout),
+            RelativeModel(event.kind, self._settings.layout, event.mount),
+            event.z,
+            event.R,
+            localization.sighting_weight,
+            localization.correlation == "factors",
+            self._options,
+        )
+        self._count_nis(f"target_{event.kind}", nis)
+        self._counters["used.sighting_own"] += own is not None
+        self._counters["used.sighting_target"] += track is not None
+        state = self.state
+        if own is not None:
+            state = state.updated(own.mean, own.cov, own.left)
+        if track is not None:
+            state = replace(state, targets={**state.targets, target: TargetState(track.mean, track.cov)})
+        if state is not self.state:
+            self.state = state
+            self.history.updated(state, None if own is None else own.left)
+
+    # -- peers ----------------------------------------------------------------------------------------------
+
+    def measured(
+        self, peer: str, t_ns: int, now_ns: int, measurements: tuple[Measurement, ...], effects: list[Effect]
+    ) -> None:
+        self.state, request = self._pairs.measured(peer, t_ns, now_ns, measurements, self.state, self.history)
+        if request is not None:
+            effects.append(Send(peer, request.epoch.t_meas_ns, request))
+
+    def instant_ns(self, event: Received) -> int:
+        body = event.message.body
+        assert isinstance(body, PairRequest)
+        return body.epoch.t_meas_ns - self._pairs.offset_ns(event)
+
+    def requested(self, event: Received, t_ns: int, effects: list[Effect]) -> None:
+        self.state = self._pairs.request(event, t_ns, self.state, self.history, effects)
+
+    def replied(self, peer: str, body: Body) -> None:
+        assert isinstance(body, PairReply)
+        self.state = self._pairs.reply(peer, body, self.state, self.history)
+
+    def link_changed(self, event: LinkChange) -> None:
+        self.state = self._pairs.link_changed(event, self.state, self.history)
+
+    def expire(self, now_ns: int, effects: list[Effect]) -> None:
+        self._pairs.expire(now_ns, effects)
+
+    def deadline_ns(self) -> int:
+        return self._pairs.deadline_ns()
