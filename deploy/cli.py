@@ -62,6 +62,13 @@ def _seed(text: str) -> int:
     return int(text)
 
 
+def usable_cores() -> int:
+    """Cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def parser() -> Parser:
     """The whole command line."""
     root = Parser(prog="cofix", description="Robots that cannot trust GPS locate each other.")
@@ -86,7 +93,19 @@ def parser() -> Parser:
     montecarlo = commands.add_parser("montecarlo", help="many trials of a scenario in virtual time")
     montecarlo.add_argument("scenario", help="a bundled name or a file")
     montecarlo.add_argument("--trials", type=_count, required=True, metavar="N")
-    montecarlo.add_argument("--jobs", type=_count, default=os.cpu_count() or 1, metavar="J")
+    montecarlo.add_argument(
+        "--jobs", type=_count, default=usable_cores(), metavar="J", help="processes (default: the usable cores)"
+    )
+    montecarlo.add_argument(
+        "--vary",
+        action="append",
+        default=[],
+        metavar="KEY=A,B",
+        help="the same trials with each value of a key; given twice, with every combination",
+    )
+    montecarlo.add_argument(
+        "--resume", action="store_true", help="go on with the trials kept in --out; --trials may be more than before"
+    )
     scenario_options(montecarlo)
 
     agent = commands.add_parser("agent", help="run one agent from its configuration file")
@@ -149,7 +168,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _montecarlo(options: argparse.Namespace) -> int:
-    from deploy.runs import montecarlo
+    from deploy.montecarlo import montecarlo
 
     return montecarlo(options)
 

@@ -1,4 +1,4 @@
-"""Carries out `cofix run` and `cofix montecarlo`: run directory, progress, figures, report, exit status."""
+"""Carries out `cofix run`: run directory, progress, figures, report, exit status; what `montecarlo` shares with it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import json
 import shlex
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,6 @@ from deploy.status import LiveTable, Progress, print_summary
 from network.links import FateRecord
 from sim.agents import agent_config, table
 from sim.engine import TrialResult
-from sim.metrics import trial_figures
-from sim.montecarlo import run_trials, write_trials
 from sim.scenario import Scenario, load
 from sim.store import load_trace, save_trace
 from sim.summary import reduce, summarize, unmet
@@ -39,14 +38,14 @@ DEMO = "demo"
 def run(options: argparse.Namespace) -> int:
     """`cofix run`."""
     name = options.scenario or DEMO
-    scenario = _load(name, options)
+    scenario = load_scenario(name, options)
     runtime = options.runtime or ("processes" if name == DEMO else "virtual")
     if runtime == "virtual" and options.speed != 1.0:
         raise ConfigError("--speed is for --runtime processes; virtual time runs as fast as it can")
     speed = options.speed if name != DEMO or options.speed != 1.0 else DEMO_SPEED
     world = open_world(scenario, options.seed)
-    run_dir = _run_dir(options.out, scenario.name)
-    _write_scenario(scenario, run_dir)
+    run_dir = new_run_dir(options.out, scenario.name)
+    write_scenario(scenario, run_dir)
     started = time.perf_counter()
     exits: dict[str, int] | None = None
     messages: list[str] = []
@@ -84,36 +83,17 @@ def run(options: argparse.Namespace) -> int:
         exits=exits,
     )
     save_trace(run_dir, result.trace, result.contacts, world.landmarks)
-    _finish(scenario, run_dir, summary, options)
+    report = write_results(scenario, run_dir, summary, options.arguments)
+    if options.json:
+        print(json.dumps(summary, allow_nan=False))
+    else:
+        print_summary(summary, run_dir, report)
     for message in messages:
         print(f"cofix: {message}", file=sys.stderr)
-    return _status(scenario, summary)
+    return exit_status(scenario, summary)
 
 
 DEMO_SPEED = 10.0
-
-
-def montecarlo(options: argparse.Namespace) -> int:
-    """`cofix montecarlo`."""
-    scenario = _load(options.scenario, options)
-    world = open_world(scenario, options.seed)
-    run_dir = _run_dir(options.out, scenario.name)
-    _write_scenario(scenario, run_dir)
-    started = time.perf_counter()
-    with Progress(f"{scenario.name}: trials", quiet=False) as progress:
-        reduced = run_trials(scenario, options.trials, options.jobs, options.seed, options.bound, progress.update)
-    summary = summarize(
-        scenario,
-        "virtual",
-        options.seed,
-        reduced,
-        simulated_s=world.steps * world.step_ns / NS,
-        timing={"wall_s": time.perf_counter() - started},
-    )
-    per_trial = [trial_figures(item["figures"]) for item in reduced]
-    write_trials(run_dir / "trials.csv", options.seed, per_trial)
-    _finish(scenario, run_dir, summary, options)
-    return _status(scenario, summary)
 
 
 def rewrite_report(run_dir: Path) -> Path:
@@ -125,14 +105,15 @@ def rewrite_report(run_dir: Path) -> Path:
     return _report(run_dir, summary)
 
 
-def _load(name: str, options: argparse.Namespace) -> Scenario:
+def load_scenario(name: str, options: argparse.Namespace, varied: Sequence[str] = ()) -> Scenario:
+    """The scenario as the command line wants it, with further overrides."""
     overrides = list(options.set)
     if options.duration is not None:
         overrides.append(f"duration_s={float(options.duration)!r}")
-    return load(name, overrides)
+    return load(name, [*overrides, *varied])
 
 
-def _run_dir(out: Path | None, name: str) -> Path:
+def new_run_dir(out: Path | None, name: str) -> Path:
     run_dir = out if out is not None else Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
     try:
         if run_dir.exists() and any(run_dir.iterdir()):
@@ -143,7 +124,7 @@ def _run_dir(out: Path | None, name: str) -> Path:
     return run_dir.resolve()
 
 
-def _write_scenario(scenario: Scenario, run_dir: Path) -> None:
+def write_scenario(scenario: Scenario, run_dir: Path) -> None:
     with (run_dir / "scenario.toml").open("wb") as file:
         tomli_w.dump(table(scenario), file)
 
@@ -179,23 +160,28 @@ def _run_virtual(scenario: Scenario, options: argparse.Namespace, world: Any, ru
     return result
 
 
-def _finish(scenario: Scenario, run_dir: Path, summary: dict[str, Any], options: argparse.Namespace) -> None:
-    (run_dir / "command.txt").write_text(shlex.join(["cofix", *options.arguments]) + "\n")
-    temporary = run_dir / "summary.tmp"
-    temporary.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
-    temporary.replace(run_dir / "summary.json")
-    report: Path | None
+def write_results(scenario: Scenario, run_dir: Path, summary: dict[str, Any], command: list[str]) -> Path | None:
+    """`command.txt`, `summary.json` and the report, whose path is returned; None, and why, when it can't be drawn.
+
+    Conditions of the scenario the summary breaks are told too.
+    """
+    (run_dir / "command.txt").write_text(shlex.join(["cofix", *command]) + "\n")
+    write_whole(run_dir / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    report: Path | None = None
     try:
         report = _report(run_dir, summary)
     except ConfigError as error:
         print(f"cofix: no report: {error}", file=sys.stderr)
-        report = None
-    if options.json:
-        print(json.dumps(summary, allow_nan=False))
-    else:
-        print_summary(summary, run_dir, report)
     for line in unmet(summary, scenario.expect):
         print(f"cofix: expectation not met: {line}", file=sys.stderr)
+    return report
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file so that nobody ever finds half of it."""
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(text)
+    temporary.replace(path)
 
 
 def _report(run_dir: Path, summary: dict[str, Any]) -> Path:
@@ -215,6 +201,6 @@ def _report(run_dir: Path, summary: dict[str, Any]) -> Path:
         raise ConfigError(str(error)) from None
 
 
-def _status(scenario: Scenario, summary: dict[str, Any]) -> int:
+def exit_status(scenario: Scenario, summary: dict[str, Any]) -> int:
     died = any(code != 0 for code in summary["exit"].values())
     return 1 if died or unmet(summary, scenario.expect) else 0

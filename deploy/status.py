@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -9,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.live import Live
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
+from rich.text import Text
 
+from sim.montecarlo import Pace
 from sim.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -49,6 +53,87 @@ class Progress:
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._bar.stop()
+
+
+class TrialProgress:
+    """Trials done, lost and failed, speed and time left, on standard error: a bar in a terminal, else some lines."""
+
+    LINE_S = 30.0
+
+    def __init__(self, total: int, pace: Pace) -> None:
+        self._total, self._pace = total, pace
+        self.title = ""
+        self.done = self.lost = self.failed = 0
+        self._told_s = time.monotonic()
+        self._ends_s: float | None = None
+        self._terminal = sys.stderr.isatty()
+        self._bar = Bar(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            _Told(self),
+            console=Console(stderr=True),
+            disable=not self._terminal,
+            transient=True,
+        )
+        self._task = self._bar.add_task("", total=total)
+
+    def kept(self, done: int, lost: int) -> None:
+        """Trials of an earlier run."""
+        self.done, self.lost = self.done + done, self.lost + lost
+        self._bar.update(self._task, description=self.title, completed=self.done)
+
+    def finished(self, *, lost: bool, failed: bool) -> None:
+        """One more trial; the pace knows it already."""
+        self.done, self.lost, self.failed = self.done + 1, self.lost + lost, self.failed + failed
+        now = time.monotonic()
+        left_s = self._pace.left_s(self._total - self.done)
+        self._ends_s = None if left_s is None else now + left_s
+        self._bar.update(self._task, description=self.title, completed=self.done)
+        if not self._terminal and now - self._told_s >= self.LINE_S:
+            self._told_s = now
+            print(f"{self.title}: {self.done} of {self._total} trials, {self.text()}", file=sys.stderr, flush=True)
+
+    def text(self) -> str:
+        """What stands beside the bar."""
+        parts = [f"{self.lost} lost"]
+        if self.failed:
+            parts.append(f"{self.failed} failed")
+        speed = self._pace.per_minute()
+        if speed is not None:
+            parts.append(f"{speed:.0f}/min" if speed >= 10.0 else f"{speed:.1f}/min")
+        if self._ends_s is not None:
+            parts.append(f"{duration(self._ends_s - time.monotonic())} left")
+        return ", ".join(parts)
+
+    def __enter__(self) -> TrialProgress:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+
+class _Told(ProgressColumn):
+    """The words beside the bar of trials; asked for again and again, so the time left counts down."""
+
+    def __init__(self, progress: TrialProgress) -> None:
+        super().__init__()
+        self._progress = progress
+
+    def render(self, task: Any) -> Text:
+        return Text(self._progress.text())
+
+
+def duration(seconds: float) -> str:
+    """Wall time for people: seconds, minutes or hours."""
+    whole = max(0, round(seconds))
+    if whole < 100:
+        return f"{whole} s"
+    minutes = round(whole / 60)
+    return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
 class LiveTable:
