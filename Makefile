@@ -23,6 +23,7 @@ test: check unit
 check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/mypy --strict examples
 
 unit: setup
 	$(BIN)/python -P -m pytest tests

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +18,19 @@ from sim.world import Output, control_odometry, drawn_belief, order, phase_of, r
 Array = NDArray[np.float64]
 
 
+@lru_cache(maxsize=1)
+def _read(path: str, stamp_ns: int) -> Recording:
+    """The recording as it was at `stamp_ns`; many trials read it once."""
+    return load(path)
+
+
+def _stamp_ns(path: str) -> int:
+    """When anything in the folder was last changed; 0 without it."""
+    folder = Path(path)
+    files = [folder, *folder.iterdir()] if folder.is_dir() else []
+    return max((item.stat().st_mtime_ns for item in files), default=0)
+
+
 class RecordedWorld:
     """A UTIAS MR.CLAM recording as a `World`. Instant 0 is the start of the span all robots have in common.
 
@@ -25,7 +41,7 @@ class RecordedWorld:
     def __init__(self, scenario: Scenario, seed: int) -> None:
         path = scenario.world.path
         assert path is not None
-        self._recording: Recording = load(path)
+        self._recording: Recording = _read(path, _stamp_ns(path))
         self._scenario, self._seed = scenario, seed
         missing = [robot.id for robot in scenario.robots if robot.id not in self._recording.robots]
         if missing:
