@@ -68,18 +68,6 @@ def test_a_readme_run_works_as_written_but_shorter(tmp_path: Path) -> None:
         assert (run / name).exists()
 
 
-def test_the_driver_example_runs() -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "interfaces.md").read_text(), re.DOTALL)
-    names: dict[str, object] = {}
-    exec(compile(code, "interfaces.md", "exec"), names)
-    from agent.sensor_input import decode
-
-    datagram = names["datagram"]
-    assert isinstance(datagram, bytes)
-    event = decode(datagram, 0, {})
-    assert getattr(event, "of", None) == "r2"
-
-
 def test_the_map_names_files_that_exist() -> None:
     text = (ROOT / "CONTRIBUTING.md").read_text()
     for floor, files in re.findall(r"^\| `(network|agent|sim|deploy)/([\w.]+)`", text, re.MULTILINE):
