@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import pytest
 from deploy import montecarlo
 from deploy.cli import main, parser, usable_cores
 from deploy.status import TrialProgress, duration
-from sim.montecarlo import Pace
+from sim.montecarlo import Pace, WorkerDied, Workers
 from sim.scenario import load
 from sim.trial_store import FILE, TrialStore, records
 
@@ -244,6 +245,24 @@ def test_when_every_trial_fails_there_is_no_summary(desk: Desk, monkeypatch: pyt
     assert "every trial failed" in err
     assert [line.split()[2] for line in err.splitlines() if "replay it" in line] == ["5", "6"]
     assert not (desk.folder / "one" / "summary.json").exists()
+
+
+def test_a_worker_that_dies_leaves_what_is_done(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    def dying(self: Workers, which: int, tasks: Any) -> Iterator[Any]:
+        yield next(iter(play(self, which, tasks)))
+        raise WorkerDied("a worker process was killed")
+
+    play = Workers.play
+    monkeypatch.setattr(Workers, "play", dying)
+    command = [*SHORT, "--trials", "3", "--jobs", "1", "--out", "one"]
+    status, out, err = desk(*command)
+    assert (status, out) == (1, "")
+    told = (
+        f"a worker process was killed; 1 of 3 trials are kept; go on with: cofix {shlex.join(['montecarlo', *command])}"
+    )
+    assert err.strip() == f"cofix: {told} --resume"
+    monkeypatch.setattr(Workers, "play", play)
+    assert desk.summary(*command, "--resume") == desk.summary(*SHORT, "--trials", "3", "--out", "two")
 
 
 # --- variants ----------------------------------------------------------------------------------------------

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import multiprocessing
+import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim.metrics import trial_figures
-from sim.montecarlo import Pace, TrialError, Workers, run_trials, write_trials
+from sim.montecarlo import Pace, TrialError, WorkerDied, Workers, run_trials, write_trials
 from sim.scenario import Scenario, load
 from sim.summary import NOT_COMPARED, reduce, summarize
 from sim.trial import run_trial
@@ -77,6 +79,19 @@ def test_leaving_in_the_middle_ends_the_workers() -> None:
 
     with pytest.raises(InterruptedError):
         leave()
+    assert multiprocessing.active_children() == []
+
+
+def test_a_worker_that_is_killed_is_told_and_takes_the_others_with_it() -> None:
+    def play() -> None:
+        with Workers([MADE], 2) as workers:
+            for _ in workers.play(0, [(seed, False) for seed in range(1, 100)]):
+                worker = multiprocessing.active_children()[0]
+                assert worker.pid is not None
+                os.kill(worker.pid, signal.SIGKILL)
+
+    with pytest.raises(WorkerDied, match="fewer --jobs"):
+        play()
     assert multiprocessing.active_children() == []
 
 
