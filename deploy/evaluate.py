@@ -14,7 +14,7 @@ from agent.shell import FATE_COLUMNS
 from deploy.launch import Outcome
 from network.messages import PairReply, ReplyStatus
 from sim.bound import BoundRunner
-from sim.engine import Sampler, TrialResult, network_figures, sample_stride
+from sim.engine import MeasurementLog, Sampler, TrialResult, network_figures, sample_stride
 from sim.scenario import Scenario
 from sim.world import World
 
@@ -43,11 +43,14 @@ def collect(scenario: Scenario, world: World, run_dir: Path, outcome: Outcome, w
     for row in _fates(scenario, run_dir):
         gone = row["in_range"] == "0" or row["lost"] == "1"
         traffic["lost" if gone else "delivered"] += 1
-    if with_bound:
-        runner = BoundRunner(scenario, world)
-        for k in range(world.steps + 1):
+    runner = BoundRunner(scenario, world) if with_bound else None
+    measured = MeasurementLog()
+    for k in range(world.steps + 1):
+        outputs = world.outputs(k) if k else []
+        measured.add(outputs)
+        if runner is not None:
             if k:
-                runner.step(k, world.outputs(k))
+                runner.step(k, outputs)
             row_index = sampler.row(k)
             if row_index is not None:
                 for entity in (*world.robots, *world.targets):
@@ -60,6 +63,7 @@ def collect(scenario: Scenario, world: World, run_dir: Path, outcome: Outcome, w
         dict(sorted(rejected.items())),
         nis,
         counters,
+        measured=measured.instants(),
     )
 
 

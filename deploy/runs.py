@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
         timing=timing,
         exits=exits,
     )
-    save_trace(run_dir, result.trace, result.contacts, world.landmarks)
+    save_trace(run_dir, result.trace, result.contacts, world.landmarks, result.measured)
     report = write_results(scenario, run_dir, summary, options.arguments)
     if options.json:
         print(json.dumps(summary, allow_nan=False))

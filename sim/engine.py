@@ -66,6 +66,26 @@ class TrialResult:
     nis: dict[str, dict[str, tuple[float, int]]]
     counters: dict[str, dict[str, int]]
     step_us: list[float] = field(default_factory=list)
+    measured: dict[tuple[str, str], Array] = field(default_factory=dict)
+    """Instants [s] at which a robot measured somebody, by (robot, of)."""
+
+
+class MeasurementLog:
+    """When a world offered a relative measurement, by robot and whom it measured."""
+
+    def __init__(self) -> None:
+        self._found: dict[tuple[str, str], list[int]] = {}
+
+    def add(self, outputs: list[Output]) -> None:
+        for item in outputs:
+            if item.of is not None:
+                times = self._found.setdefault((item.robot, item.of), [])
+                if not times or times[-1] != item.t_ns:
+                    times.append(item.t_ns)
+
+    def instants(self) -> dict[tuple[str, str], Array]:
+        """Ascending times [s] by (robot, of); sensors that measure together count once."""
+        return {key: np.unique(times) / NS for key, times in sorted(self._found.items())}
 
 
 def sample_stride(step_ns: int) -> int:
@@ -110,7 +130,8 @@ class Sampler:
         }
 
         def state(entity: str, belief: tuple[Array, Array]) -> StateTrace:
-            return StateTrace(truths[entity], belief[0], belief[1], self._layouts[entity].angles)
+            layout = self._layouts[entity]
+            return StateTrace(truths[entity], belief[0], belief[1], layout.angles, layout.position)
 
         bound = None
         if self._bound is not None:
@@ -167,6 +188,7 @@ class VirtualEngine:
         self._sampler = Sampler(scenario, world, with_bound)
         self._bound = BoundRunner(scenario, world) if with_bound else None
         self.contacts: list[tuple[float, str, str]] = []
+        self._measured = MeasurementLog()
         self._applied: dict[str, int] = {}
         self._bases: dict[tuple[str, str], Epoch] = {}
         self._traffic: Counter[str] = Counter()
@@ -181,6 +203,7 @@ class VirtualEngine:
         for k in range(1, self._world.steps + 1):
             started = time.perf_counter()
             outputs = self._world.outputs(k)
+            self._measured.add(outputs)
             for item in outputs:
                 self._push(item.t_ns, int(item.phase), item.robot, item)
             self._play(k)
@@ -299,4 +322,5 @@ class VirtualEngine:
             nis,
             counters,
             self.step_us,
+            self._measured.instants(),
         )

@@ -24,12 +24,17 @@ MAX_SERIES = 400
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateTrace:
-    """Truth (K, n), estimated mean (K, n) and covariance (K, n, n) over K instants; `angles` are wrapped."""
+    """Truth (K, n), estimated mean (K, n) and covariance (K, n, n) over K instants.
+
+    `angles` are wrapped, the first is the heading; `position` is where x, y and perhaps z sit. What else there is are
+    velocities in a state without heading, and parameters of the robot's odometry in one with it.
+    """
 
     truth: Array
     mean: Array
     cov: Array
     angles: tuple[int, ...]
+    position: tuple[int, ...] = (0, 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,12 +50,32 @@ class TrialTrace:
     bound: dict[str, dict[str, StateTrace]] | None = None
 
 
+def components(trace: StateTrace) -> list[str]:
+    """Name of each component of the state, with its unit where it has one: `x_m`, `heading_rad`, `vx_mps`."""
+    found, others = [], 0
+    for index in range(trace.truth.shape[1]):
+        if index in trace.position:
+            found.append(f"{'xyz'[trace.position.index(index)]}_m")
+        elif index in trace.angles:
+            found.append("heading_rad")
+        else:
+            found.append(f"parameter_{others + 1}" if trace.angles else f"v{'xyz'[others]}_mps")
+            others += 1
+    return found
+
+
 def errors(trace: StateTrace) -> Array:
     """Estimate minus truth (K, n), angles wrapped."""
     error = trace.mean - trace.truth
     for index in trace.angles:
         error[:, index] = wrap(error[:, index])
     return error
+
+
+def position_errors(trace: StateTrace) -> Array:
+    """Distance of estimate and truth (K,), over all components of the position."""
+    error = trace.mean[:, list(trace.position)] - trace.truth[:, list(trace.position)]
+    return np.asarray(np.sqrt(np.sum(error**2, axis=1)))
 
 
 def nees(trace: StateTrace) -> Array:
@@ -78,20 +103,22 @@ def _positive_definite(cov: Array) -> NDArray[np.bool_]:
 
 
 def _reduced(trace: StateTrace, inside: NDArray[np.bool_], stride: int) -> dict[str, Any]:
-    """Counts and sums over the window, maxima, last error, and every `stride`-th sample for the series.
+    """Counts and sums over the window, extremes, last error, and every `stride`-th sample for the series.
 
     `heading` and `velocity` are sums of squares, None for a state that has no such components.
     """
     error, ratio = errors(trace), nees(trace)
-    squared = error[:, 0] ** 2 + error[:, 1] ** 2
+    squared = np.sum(error[:, list(trace.position)] ** 2, axis=1)
     seen = np.isfinite(error).all(axis=1)
     use = inside & seen
     within = error[use]
     sigma = np.sqrt(np.maximum(np.diagonal(trace.cov, axis1=1, axis2=2)[use], 0.0))
-    velocity = [index for index in range(2, error.shape[1]) if index not in trace.angles]
+    names = components(trace)
+    velocity = [index for index, name in enumerate(names) if name.endswith("_mps")]
     usable = use & np.isfinite(ratio)
     present = np.flatnonzero(seen)
     return {
+        "names": names,
         "count": int(use.sum()),
         "position": float(squared[use].sum()),
         "heading": float(np.sum(within[:, list(trace.angles)] ** 2)) if trace.angles else None,
@@ -100,6 +127,7 @@ def _reduced(trace: StateTrace, inside: NDArray[np.bool_], stride: int) -> dict[
         "nees": float(ratio[usable].sum()),
         "inside": float(np.sum(np.abs(within) <= 3.0 * sigma)) / error.shape[1],
         "max_position": float(np.sqrt(squared[use].max())) if len(within) else None,
+        "min": [float(value) for value in np.abs(within).min(axis=0)] if len(within) else None,
         "max": [float(value) for value in np.abs(within).max(axis=0)] if len(within) else None,
         "final": float(np.sqrt(squared[present[-1]])) if len(present) else None,
         "series": np.where(seen, squared, np.nan)[::stride],
@@ -172,28 +200,35 @@ def _median(values: Sequence[float | None]) -> float | None:
     return float(np.median(known)) if known else None
 
 
+def _largest(values: Sequence[float | None]) -> float | None:
+    return max((value for value in values if value is not None), default=None)
+
+
 def _entity(items: Sequence[dict[str, Any]], robot: bool) -> dict[str, Any]:
     """Figures of one robot, or of one robot's track of one target, over trials.
 
     RMSE, `anees` and `containment_3sigma` (the share of components within three of their standard deviations) are
-    over all samples of all trials, `position_error_max_m` is the largest of all; `final_position_error_m` and
-    `error_max` are medians over trials of the last error and of each component's largest.
+    over all samples of all trials, `position_error_max_m` is the largest of all; `final_position_error_m` is the median
+    over trials of the last error. Of each component's absolute error, `error_min` and `error_max` are medians over
+    trials of the smallest and largest in a trial, `error_worst` is the largest of all. `dof` is the size of the state.
     """
-    figures: dict[str, Any] = {"position_rmse_m": _rmse(items)}
+    names = items[0]["names"]
+    figures: dict[str, Any] = {"dof": len(names), "position_rmse_m": _rmse(items)}
     for key, name in (("heading", "heading_rmse_rad"), ("velocity", "velocity_rmse_mps")):
         if items[0][key] is not None:
             figures[name] = _rmse(items, key)
     if robot:
-        largest = [item["max_position"] for item in items if item["max_position"] is not None]
-        figures["position_error_max_m"] = max(largest, default=None)
+        figures["position_error_max_m"] = _largest([item["max_position"] for item in items])
         figures["final_position_error_m"] = _median([item["final"] for item in items])
     figures["anees"] = _anees(items)
     figures["containment_3sigma"] = _ratio(items, "inside")
-    if robot:
-        names = ("x_m", "y_m", "heading_rad") if items[0]["heading"] is not None else ("x_m", "y_m")
-        figures["error_max"] = {
-            name: _median([item["max"][index] for item in items if item["max"] is not None])
-            for index, name in enumerate(names)
+    for key, of, over in (
+        ("error_min", "min", _median),
+        ("error_max", "max", _median),
+        ("error_worst", "max", _largest),
+    ):
+        figures[key] = {
+            name: over([item[of][index] for item in items if item[of] is not None]) for index, name in enumerate(names)
         }
     return figures
 
@@ -290,5 +325,8 @@ def _series(trials: Sequence[dict[str, Any]]) -> dict[str, Any]:
     if first["bound"] is not None:
         series["bound_position_rmse_m"] = {
             n: over(lambda t, n=n: t["bound"]["robots"][n]["series"], True) for n in first["robots"]
+        }
+        series["bound_target_position_rmse_m"] = {
+            n: over(lambda t, n=n: t["bound"]["targets"][n]["series"], True) for n in first["targets"]
         }
     return series

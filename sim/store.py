@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim.metrics import StateTrace, TrialTrace
 
 FILE = "trace.npz"
 
+Instants = dict[tuple[str, str], NDArray[np.float64]]
+"""Times [s] at which a robot measured somebody, by (robot, of)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """A trial's samples with the contacts (time [s], robot, peer) and landmarks."""
+    """A trial's samples with the contacts (time [s], robot, peer), landmarks, and instants of relative measurements."""
 
     trace: TrialTrace
     contacts: list[tuple[float, str, str]]
     landmarks: dict[str, tuple[float, float]]
+    measured: Instants = field(default_factory=dict)
 
 
 def save_trace(
@@ -28,14 +33,15 @@ def save_trace(
     trace: TrialTrace,
     contacts: list[tuple[float, str, str]],
     landmarks: dict[str, tuple[float, float]],
+    measured: Instants | None = None,
 ) -> None:
-    """Write `trace.npz`."""
+    """Write `trace.npz`. Instants are kept to the microsecond as gaps, which are nearly all alike and so pack well."""
     arrays: dict[str, Any] = {"t_s": trace.t_s}
     index: list[dict[str, Any]] = []
 
     def add(group: str, names: list[str], state: StateTrace) -> None:
         key = str(len(index))
-        index.append({"group": group, "names": names, "angles": list(state.angles)})
+        index.append({"group": group, "names": names, "angles": list(state.angles), "position": list(state.position)})
         arrays[f"{key}.truth"], arrays[f"{key}.mean"], arrays[f"{key}.cov"] = state.truth, state.mean, state.cov
 
     for name, state in trace.robots.items():
@@ -46,7 +52,15 @@ def save_trace(
     for group, states in (trace.bound or {}).items():
         for name, state in states.items():
             add(f"bound.{group}", [name], state)
-    meta = {"index": index, "contacts": contacts, "landmarks": landmarks, "bound": trace.bound is not None}
+    for place, times in enumerate((measured or {}).values()):
+        arrays[f"measured.{place}"] = np.diff(np.round(times * 1e6).astype(np.int64), prepend=0)
+    meta = {
+        "index": index,
+        "contacts": contacts,
+        "landmarks": landmarks,
+        "bound": trace.bound is not None,
+        "measured": list(measured or {}),
+    }
     np.savez_compressed(run_dir / FILE, meta=np.array(json.dumps(meta)), **arrays)
 
 
@@ -61,7 +75,13 @@ def load_trace(run_dir: Path) -> Stored | None:
         targets: dict[str, dict[str, StateTrace]] = {}
         bound: dict[str, dict[str, StateTrace]] = {"robots": {}, "targets": {}}
         for key, entry in enumerate(meta["index"]):
-            state = StateTrace(data[f"{key}.truth"], data[f"{key}.mean"], data[f"{key}.cov"], tuple(entry["angles"]))
+            state = StateTrace(
+                data[f"{key}.truth"],
+                data[f"{key}.mean"],
+                data[f"{key}.cov"],
+                tuple(entry["angles"]),
+                tuple(entry.get("position", (0, 1))),
+            )
             names = entry["names"]
             if entry["group"] == "robots":
                 robots[names[0]] = state
@@ -70,5 +90,10 @@ def load_trace(run_dir: Path) -> Stored | None:
             else:
                 bound[entry["group"].removeprefix("bound.")][names[0]] = state
         trace = TrialTrace(t_s=data["t_s"], robots=robots, targets=targets, bound=bound if meta["bound"] else None)
+        measured = {
+            (str(robot), str(of)): np.cumsum(data[f"measured.{place}"]) * 1e-6
+            for place, (robot, of) in enumerate(meta.get("measured", []))
+        }
     contacts = [(float(t), str(a), str(b)) for t, a, b in meta["contacts"]]
-    return Stored(trace, contacts, {name: (float(x), float(y)) for name, (x, y) in meta["landmarks"].items()})
+    landmarks = {name: (float(x), float(y)) for name, (x, y) in meta["landmarks"].items()}
+    return Stored(trace, contacts, landmarks, measured)

@@ -20,9 +20,11 @@ from sim.metrics import (
     StateTrace,
     TrialTrace,
     combine,
+    components,
     errors,
     is_lost,
     nees,
+    position_errors,
     reduce_trial,
     summarize,
     trial_figures,
@@ -107,16 +109,27 @@ def test_figures_are_what_plain_loops_give() -> None:
         assert entry["anees"] == pytest.approx(statistics.fmean(ratios(found)))
         inside = [abs(e[i]) <= 3.0 * math.sqrt(P[i, i]) for e, P in found for i in range(3)]
         assert entry["containment_3sigma"] == pytest.approx(statistics.fmean(inside))
+        assert entry["dof"] == 3
         for index, key in enumerate(("x_m", "y_m", "heading_rad")):
             largest = [max(abs(e[index]) for e, _ in items) for items in own]
+            smallest = [min(abs(e[index]) for e, _ in items) for items in own]
             assert entry["error_max"][key] == pytest.approx(statistics.median(largest))
+            assert entry["error_worst"][key] == pytest.approx(max(largest))
+            assert entry["error_min"][key] == pytest.approx(statistics.median(smallest))
         assert "velocity_rmse_mps" not in entry
     tracked = []
     for name in ("r1", "r2"):
-        found = samples([(t.t_s, t.targets["t1"][name]) for t in traces])
+        own = [samples([(t.t_s, t.targets["t1"][name])]) for t in traces]
+        found = [item for items in own for item in items]
         tracked += found
         entry = summary["targets"]["t1"][name]
-        assert set(entry) == {"position_rmse_m", "velocity_rmse_mps", "anees", "containment_3sigma"}
+        assert set(entry) == {
+            "dof", "position_rmse_m", "velocity_rmse_mps", "anees", "containment_3sigma",
+            "error_min", "error_max", "error_worst",
+        }  # fmt: skip
+        for index, key in enumerate(("x_m", "y_m", "vx_mps", "vy_mps")):
+            largest = [max(abs(e[index]) for e, _ in items) for items in own]
+            assert entry["error_max"][key] == pytest.approx(statistics.median(largest))
         assert entry["velocity_rmse_mps"] == pytest.approx(rms([math.hypot(e[2], e[3]) for e, _ in found]))
         assert entry["anees"] == pytest.approx(statistics.fmean(ratios(found)))
     fleet = summary["fleet"]
@@ -196,10 +209,24 @@ def test_heading_and_velocity_are_not_mixed_in_a_mixed_fleet() -> None:
     assert summary["fleet"]["heading_rmse_rad"] == summary["robots"]["rover"]["heading_rmse_rad"]
     assert "heading_rmse_rad" not in summary["robots"]["drone"]
     assert summary["robots"]["drone"]["velocity_rmse_mps"] > 0.0
-    assert list(summary["robots"]["drone"]["error_max"]) == ["x_m", "y_m"]
+    assert list(summary["robots"]["drone"]["error_max"]) == ["x_m", "y_m", "vx_mps", "vy_mps"]
     alone = summarize([TrialTrace(np.arange(71.0), {"drone": drone}, {})], WINDOW, LOST_M)
     assert alone["fleet"]["heading_rmse_rad"] is None
     assert alone["fleet"]["target_position_rmse_m"] is None
+
+
+def test_position_is_where_the_state_says_and_parameters_are_no_velocities() -> None:
+    rng = np.random.default_rng(4)
+    plain = honest(rng, 71, 6, (3,))
+    flying = StateTrace(plain.truth, plain.mean, plain.cov, (3,), (0, 1, 2))
+    assert components(flying) == ["x_m", "y_m", "z_m", "heading_rad", "parameter_1", "parameter_2"]
+    entry = summarize([TrialTrace(np.arange(71.0), {"drone": flying}, {})], WINDOW, LOST_M)["robots"]["drone"]
+    found = samples([(np.arange(71.0), flying)])
+    assert entry["position_rmse_m"] == pytest.approx(rms([float(np.linalg.norm(e[:3])) for e, _ in found]))
+    assert entry["heading_rmse_rad"] == pytest.approx(rms([e[3] for e, _ in found]))
+    assert "velocity_rmse_mps" not in entry
+    assert list(entry["error_max"])[2] == "z_m"
+    assert position_errors(flying)[20] == pytest.approx(float(np.linalg.norm(errors(flying)[20, :3])))
 
 
 def test_a_covariance_that_is_none_is_counted_and_gives_no_nees() -> None:
@@ -284,6 +311,7 @@ def test_a_long_trial_is_reduced_to_a_small_record() -> None:
         assert len(series["position_rmse_m"][name]) == len(series["anees"][name]) == len(series["t_s"])
     assert len(series["target_position_rmse_m"]["t1"]["r2"]) == len(series["t_s"])
     assert len(series["bound_position_rmse_m"]["r1"]) == len(series["t_s"])
+    assert len(series["bound_target_position_rmse_m"]["t1"]) == len(series["t_s"])
 
 
 def test_series_are_over_the_trials_that_have_an_estimate() -> None:

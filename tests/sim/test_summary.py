@@ -39,9 +39,9 @@ def test_the_keys_of_schema_1(summary: dict[str, Any]) -> None:
         "containment_3sigma", "error_max", "nis",
     } <= summary["robots"]["r1"].keys()  # fmt: skip
     assert summary["robots"]["r1"]["error_max"].keys() == {"x_m", "y_m", "heading_rad"}
-    assert {"position_rmse_m", "heading_rmse_rad", "anees", "containment_3sigma"} <= summary["targets"]["t1"][
-        "r1"
-    ].keys()
+    assert {
+        "position_rmse_m", "heading_rmse_rad", "anees", "containment_3sigma", "error_min", "error_max", "error_worst",
+    } <= summary["targets"]["t1"]["r1"].keys()  # fmt: skip
     for part in ("fleet", "all", "median", "bound"):
         assert summary[part].keys() >= FLEET
     assert summary["network"].keys() == {"sent", "delivered", "lost", "bytes", "bytes_per_robot_s", "pair"}
