@@ -123,8 +123,9 @@ def parser() -> Parser:
     replay.add_argument("recording", type=Path)
     replay.add_argument("--robot", help="only this one")
 
-    report = commands.add_parser("report", help="write the report of a run directory again")
-    report.add_argument("directory", type=Path)
+    report = commands.add_parser("report", help="write the report of a run directory again, or compare several runs")
+    report.add_argument("directories", type=Path, nargs="+", metavar="DIR")
+    report.add_argument("--out", type=Path, help="of a comparison (default: runs/comparison-TIME)")
     return root
 
 
@@ -216,9 +217,9 @@ def _replay(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from deploy.runs import rewrite_report
+    from deploy.runs import report
 
-    path = rewrite_report(options.directory)
+    path = report(options)
     print(json.dumps({"report": str(path)}) if not sys.stdout.isatty() else f"report: {path}")
     return 0
 

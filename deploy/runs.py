@@ -96,13 +96,58 @@ def run(options: argparse.Namespace) -> int:
 DEMO_SPEED = 10.0
 
 
-def rewrite_report(run_dir: Path) -> Path:
-    """`cofix report`. Raises `ConfigError` when the directory holds no run."""
+def report(options: argparse.Namespace) -> Path:
+    """`cofix report`: a run's report again, or the comparison of several runs or of a run's variants.
+
+    Raises `ConfigError` when a directory holds no run.
+    """
+    directories: list[Path] = options.directories
+    if len(directories) == 1:
+        (run_dir,) = directories
+        variants = _variants(run_dir)
+        if options.out is not None:
+            raise ConfigError("--out: a single run's report stays in its directory; name several to compare them")
+        if not variants:
+            return _report(run_dir, _summary(run_dir))
+        for _, path in variants:
+            _report(path, _summary(path))
+        return _compare(variants, run_dir, run_dir.resolve().name)
+    runs = [run for path in directories for run in _variants(path) or [("", path)]]
+    named = [(name or path.resolve().name, path) for name, path in runs]
+    names = [name for name, _ in named]
+    named = [(name if names.count(name) == 1 else str(path), path) for name, path in named]
+    for _, path in named:
+        _summary(path)
+    again = options.out is not None and (options.out / "comparison.html").exists()
+    out = options.out if again else new_run_dir(options.out, "comparison")
+    return _compare(named, out, out.resolve().name)
+
+
+def _summary(run_dir: Path) -> dict[str, Any]:
     try:
-        summary = json.loads((run_dir / "summary.json").read_text())
+        found: dict[str, Any] = json.loads((run_dir / "summary.json").read_text())
     except (OSError, ValueError):
         raise ConfigError(f"{run_dir}: no readable summary.json; name the directory of a finished run") from None
-    return _report(run_dir, summary)
+    return found
+
+
+def _variants(run_dir: Path) -> list[tuple[str, Path]]:
+    """(name, directory) of the variants a run varied, none if it varied nothing."""
+    try:
+        names = json.loads((run_dir / "variants.json").read_text())["variants"]
+    except (OSError, ValueError, KeyError):
+        return []
+    return [(name, run_dir / name) for name in names]
+
+
+def _compare(runs: list[tuple[str, Path]], out: Path, title: str) -> Path:
+    from sim.comparison import NoRun, write_comparison
+    from sim.plots import ReportUnavailable
+
+    try:
+        return write_comparison(runs, out, title)
+    except (NoRun, ReportUnavailable) as error:
+        raise ConfigError(str(error)) from None
 
 
 def load_scenario(name: str, options: argparse.Namespace, varied: Sequence[str] = ()) -> Scenario:
@@ -187,16 +232,8 @@ def write_whole(path: Path, text: str) -> None:
 def _report(run_dir: Path, summary: dict[str, Any]) -> Path:
     from sim.report import ReportUnavailable, write_report
 
-    stored = load_trace(run_dir)
     try:
-        return write_report(
-            run_dir,
-            summary,
-            stored.trace if stored is not None else None,
-            stored.contacts if stored is not None else None,
-            stored.landmarks if stored is not None else {},
-            summary["scenario"],
-        )
+        return write_report(run_dir, summary, load_trace(run_dir), summary["scenario"])
     except ReportUnavailable as error:
         raise ConfigError(str(error)) from None
 

@@ -18,7 +18,18 @@ from sim.scenario import Scenario
 FILE = "montecarlo.json"
 SHOWN = 3
 FLOORS = ("network", "agent", "sim")
-DRAWING = ("report.py", "plots.py", "comparison.py")
+DRAWING = (
+    "report.py",
+    "page.py",
+    "tables.py",
+    "plots.py",
+    "error_plots.py",
+    "series_plots.py",
+    "availability.py",
+    "animation.py",
+    "comparison.py",
+    "settings_table.py",
+)
 """Files of `sim` that look at figures only when they are there."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import builtins
+import json
 import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
@@ -14,15 +15,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim import plots
+from sim import availability, plots
+from sim.animation import unpack
 from sim.metrics import StateTrace, TrialTrace, summarize
 from sim.report import ReportUnavailable, write_report
+from sim.store import Instants, Stored
 
 Array = NDArray[np.float64]
 PNG = b"\x89PNG\r\n\x1a\n"
 SECONDS = 60
 LANDMARKS = {"L6": (0.0, 5.0), "L7": (4.0, -3.0)}
 CONTACTS = [(5.0, "r1", "r2"), (5.1, "r2", "r1"), (9.0, "r3", "r1")]
+MEASURED: Instants = {
+    ("r1", "r2"): np.arange(3.0, 20.0),
+    ("r1", "target:t1"): np.arange(0.0, 60.0),
+    ("r2", "target:t1"): np.arange(30.0, 45.0),
+}
 
 
 def circle(rng: np.random.Generator, radius: float, n: int = 3) -> StateTrace:
@@ -43,6 +51,11 @@ def trial(seed: int, robots: int = 3) -> TrialTrace:
     tracks["r1"].mean[:20], tracks["r1"].cov[:20] = np.nan, np.nan
     own = {"robots": {name: circle(rng, 2.0) for name in names}, "targets": {"t1": circle(rng, 1.0, 4)}}
     return TrialTrace(np.arange(SECONDS + 1) * 1.0, fleet, {"t1": tracks}, own)
+
+
+def kept(trace: TrialTrace) -> Stored:
+    """The trial with a few contacts and measurements, as a run directory keeps it."""
+    return Stored(trace, CONTACTS, LANDMARKS, MEASURED)
 
 
 def summary_of(traces: list[TrialTrace], **change: Any) -> dict[str, Any]:
@@ -84,6 +97,7 @@ class Page(HTMLParser):
         self.outside: list[str] = []
         self.rows: list[list[str]] = []
         self.words: list[str] = []
+        self.scripts: list[str] = []
         self._open: list[str] = []
         self.feed(path.read_text(encoding="utf-8"))
         self.close()
@@ -92,7 +106,7 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         given = dict(attrs)
-        if tag not in ("meta", "img", "br"):
+        if tag not in ("meta", "img", "br", "input"):
             self._open.append(tag)
         if tag == "tr":
             self.rows.append([])
@@ -104,7 +118,7 @@ class Page(HTMLParser):
                 self.pictures[given.get("alt") or ""] = base64.b64decode(value.partition(",")[2], validate=True)
             elif value:
                 self.outside.append(value)
-        if tag in ("script", "link", "iframe"):
+        if tag in ("link", "iframe"):
             self.outside.append(tag)
 
     def handle_endtag(self, tag: str) -> None:
@@ -114,6 +128,10 @@ class Page(HTMLParser):
         if self._open and self._open[-1] == "style":
             if "url(" in data or "@import" in data:
                 self.outside.append(data)
+            return
+        if self._open and self._open[-1] == "script":
+            self.outside += re.findall(r"\w*://\S*|fetch\(|XMLHttpRequest|import\(", data)
+            self.scripts.append(data)
             return
         self.words.append(data)
         if {"td", "th"} & set(self._open):
@@ -139,7 +157,7 @@ def one_trial(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str,
     (run_dir / "command.txt").write_text("cofix run circles --seed 7 --set 'name=\"<b>\"'\n")
     trace = trial(1)
     summary = summary_of([trace])
-    path = write_report(run_dir, summary, trace, CONTACTS, LANDMARKS, "Circles & <targets>")
+    path = write_report(run_dir, summary, kept(trace), "Circles & <targets>")
     assert path == run_dir / "report.html"
     return run_dir, summary, Page(path)
 
@@ -148,10 +166,10 @@ def test_the_page_stands_alone_with_all_pictures_inside(one_trial: tuple[Path, d
     run_dir, _, page = one_trial
     assert page.outside == []
     files = sorted(file.name for file in (run_dir / "plots").iterdir())
-    assert files == ["contacts.png", "errors.png", "nees.png", "targets.png", "trajectories.png"]
+    assert files == ["contacts.png", "errors.png", "nees.png", "sightings.png", "targets.png", "trajectories.png"]
     embedded = sorted(page.pictures.values())
     assert embedded == sorted((run_dir / "plots" / name).read_bytes() for name in files)
-    assert all(data.startswith(PNG) and len(data) > 2_000 for data in embedded)
+    assert all(data.startswith(PNG) and len(data) > 1_000 for data in embedded)
 
 
 def test_the_page_says_what_the_summary_says(one_trial: tuple[Path, dict[str, Any], Page]) -> None:
@@ -163,7 +181,7 @@ def test_the_page_says_what_the_summary_says(one_trial: tuple[Path, dict[str, An
     assert "12,345 messages" in page.text
     assert "321 B sent per robot and second" in page.text
     for name, entry in summary["robots"].items():
-        row = page.row(name)
+        row = next(row for row in page.rows if row and row[0] == name)
         assert row[1] == f"{entry['position_rmse_m']:.3f}"
         assert row[4] == f"{entry['heading_rmse_rad']:.3f}"
         assert row[5] == f"{entry['anees']:.2f}"
@@ -173,8 +191,51 @@ def test_the_page_says_what_the_summary_says(one_trial: tuple[Path, dict[str, An
     track = summary["targets"]["t1"]["r2"]
     assert page.row("t1 by r2")[1:3] == [f"{track['position_rmse_m']:.3f}", f"{track['velocity_rmse_mps']:.3f}"]
     assert page.row("duplicate") == ["duplicate", "17"]
-    assert page.row("bytes sent") == ["bytes sent", "3.5 MB"]
-    assert page.row("contacts used by both sides") == ["contacts used by both sides", "36"]
+    assert page.row("bytes sent") == ["bytes sent", "3.5 MB", "321 B"]
+    assert page.row("messages sent") == ["messages sent", "12,345", f"{12345 / (60.0 * 3):.3f}"]
+    assert page.row("contacts used by both sides") == ["contacts used by both sides", "36", "0.200"]
+
+
+def test_extremes_stand_side_by_side_as_smallest_and_largest(one_trial: tuple[Path, dict[str, Any], Page]) -> None:
+    _, summary, page = one_trial
+    (line,) = [index for index, row in enumerate(page.rows) if row == ["", "own state", "track of t1"]]
+    assert page.rows[line + 1] == ["", "x [m]", "y [m]", "heading [rad]", "x [m]", "y [m]", "vx [m/s]", "vy [m/s]"]
+    own, track = summary["robots"]["r2"], summary["targets"]["t1"]["r2"]
+    row = page.rows[line + 3]
+    assert row[0] == "r2"
+    assert row[3] == f"{own['error_min']['heading_rad']:.2f} / {own['error_max']['heading_rad']:.2f}"
+    assert row[4] == f"{track['error_min']['x_m']:.2f} / {track['error_max']['x_m']:.2f}"
+
+
+def test_over_trials_extremes_are_the_median_and_the_worst(tmp_path: Path) -> None:
+    summary = summary_of([trial(seed) for seed in range(3)])
+    page = Page(write_report(tmp_path, summary, None, "circles"))
+    own = summary["robots"]["r1"]
+    assert own["error_worst"]["x_m"] > own["error_max"]["x_m"]
+    assert f"{own['error_max']['x_m']:.2f} / {own['error_worst']['x_m']:.2f}" in [
+        row[1] for row in page.rows if row[1:]
+    ]
+
+
+def test_innovations_far_from_one_are_flagged(tmp_path: Path) -> None:
+    summary = summary_of([trial(1)])
+    summary["robots"]["r1"]["nis"] = {"pair_range": 1.1, "pose": 2.5}
+    summary["robots"]["r2"]["nis"] = {"pair_range": 0.2}
+    page = Page(write_report(tmp_path, summary, None, "circles"))
+    assert ["r1", "1.10", "2.50 ▲"] in page.rows
+    assert ["r2", "0.20 ▽", "–"] in page.rows
+    assert ["ideal", "1", "1"] in page.rows
+    assert '<td class="warn">2.50 ▲</td>' in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_player_has_the_trial(one_trial: tuple[Path, dict[str, Any], Page]) -> None:
+    _, _, page = one_trial
+    data, script = page.scripts
+    film = json.loads(data)
+    assert [robot["name"] for robot in film["robots"]] == ["r1", "r2", "r3"]
+    truth = trial(1).robots["r2"].truth
+    np.testing.assert_allclose(unpack(film["robots"][1]["channels"]["X"]), truth[:, 0], atol=1e-3)
+    assert "getContext" in script
 
 
 def test_names_and_the_command_are_shown_not_interpreted(one_trial: tuple[Path, dict[str, Any], Page]) -> None:
@@ -192,9 +253,9 @@ def test_a_quiet_run_has_no_warnings_and_an_ill_one_says_why(
     trace = trial(1)
     trace.robots["r2"].mean[:, 0] += 20.0
     ill = summary_of([trace], exit={"r1": 0, "r2": -9, "r3": 0}, faults=["loss 0.3"], covariance_unusable=2)
-    page = Page(write_report(tmp_path, ill, None, None, {}, "ill"))
+    page = Page(write_report(tmp_path, ill, None, "ill"))
     assert "Agents that ended early: r2 (exit -9)." in page.text
-    assert page.row("r2")[-1] == "-9"
+    assert "-9" in [row[-1] for row in page.rows if row and row[0] == "r2"]
     assert "Injected: loss 0.3." in page.text
     assert "this trial counts as lost" in page.text
     assert "2 estimates had no positive definite covariance" in page.text
@@ -204,9 +265,11 @@ def test_a_quiet_run_has_no_warnings_and_an_ill_one_says_why(
 def test_many_trials_show_errors_over_time_and_who_was_lost(tmp_path: Path) -> None:
     traces = [trial(seed) for seed in range(4)]
     traces[2].robots["r1"].mean[:, 1] += 30.0
-    page = Page(write_report(tmp_path, summary_of(traces), None, None, {}, "circles"))
-    assert [file.name for file in (tmp_path / "plots").iterdir()] == ["rmse.png"]
-    assert list(page.pictures) == ["Position error over time"]
+    page = Page(write_report(tmp_path, summary_of(traces), None, "circles"))
+    assert sorted(file.name for file in (tmp_path / "plots").iterdir()) == ["anees.png", "rmse.png"]
+    assert list(page.pictures) == ["Position error over time", "Consistency over time"]
+    assert page.scripts == []
+    assert "averages of 3 trials of an honest filter" in page.text
     assert "1 of 4 trials lost" in page.text
     assert page.row("fleet, median trial")
     assert float(page.row("fleet, lost trials included")[1]) > float(page.row("fleet")[1])
@@ -215,8 +278,12 @@ def test_many_trials_show_errors_over_time_and_who_was_lost(tmp_path: Path) -> N
 def test_a_run_without_targets_bound_or_contacts_is_a_shorter_page(tmp_path: Path) -> None:
     full = trial(1)
     trace = TrialTrace(full.t_s, full.robots, {})
-    page = Page(write_report(tmp_path, summary_of([trace], rejected={}), trace, None, {}, "alone"))
-    assert sorted(page.pictures) == ["Consistency", "Errors inside their claimed bounds", "Where they went"]
+    page = Page(write_report(tmp_path, summary_of([trace], rejected={}), Stored(trace, [], {}), "alone"))
+    assert sorted(page.pictures) == [
+        "Consistency",
+        "Localization errors inside their claimed bounds",
+        "Where they went",
+    ]
     assert "centralized filter" not in {row[0] for row in page.rows if row}
     assert "No message was refused." in page.text
 
@@ -225,28 +292,29 @@ def test_robots_that_never_had_an_estimate_do_not_stop_the_report(tmp_path: Path
     trace = trial(1)
     for states in (trace.robots, trace.targets["t1"]):
         states["r3"].mean[:], states["r3"].cov[:] = np.nan, np.nan
-    page = Page(write_report(tmp_path, summary_of([trace]), trace, CONTACTS, LANDMARKS, "silent"))
-    assert page.row("r3")[1] == "–"
-    assert len(page.pictures) == 5
+    page = Page(write_report(tmp_path, summary_of([trace]), kept(trace), "silent"))
+    assert "–" in [row[1] for row in page.rows if row and row[0] == "r3"]
+    assert len(page.pictures) == 6
 
 
 def test_a_big_fleet_is_cut_to_what_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plots, "MAX_PANELS", 2)
-    monkeypatch.setattr(plots, "MAX_PAIRS", 3)
+    monkeypatch.setattr(availability, "MAX_ROWS", 3)
     trace = trial(1, robots=9)
     contacts = [(1.0, f"r{a}", f"r{b}") for a in range(1, 10) for b in range(1, a)]
-    page = Page(write_report(tmp_path, summary_of([trace]), trace, contacts, {}, "swarm"))
+    page = Page(write_report(tmp_path, summary_of([trace]), Stored(trace, contacts, {}), "swarm"))
     assert page.text.count("The 2 with the largest errors of 9.") == 3
     heights = {name: int.from_bytes(data[20:24], "big") / plots.DPI for name, data in page.pictures.items()}
-    assert heights["Errors inside their claimed bounds"] < 3.5
-    assert heights["Contacts"] < 2.0
-    assert [row[0] for row in page.rows if re.fullmatch(r"r\d+", row[0])] == [f"r{k}" for k in range(1, 10)]
+    assert heights["Localization errors inside their claimed bounds"] < 3.5
+    assert heights["Who could measure whom, and contacts"] < 2.0
+    named = [row[0] for row in page.rows if re.fullmatch(r"r\d+", row[0])]
+    assert named[:9] == [f"r{k}" for k in range(1, 10)]
 
 
 def test_writing_it_again_replaces_it(tmp_path: Path) -> None:
     trace = trial(1)
     for title in ("first", "second"):
-        write_report(tmp_path, summary_of([trace]), None, None, {}, title)
+        write_report(tmp_path, summary_of([trace]), None, title)
     assert "second" in Page(tmp_path / "report.html").text
 
 
@@ -260,7 +328,7 @@ def test_without_matplotlib_the_remedy_is_named(tmp_path: Path, monkeypatch: pyt
 
     monkeypatch.setattr(builtins, "__import__", refuse)
     with pytest.raises(ReportUnavailable, match=r"pip install 'cofix\[report\]'"):
-        write_report(tmp_path, summary_of([trial(1)]), None, None, {}, "none")
+        write_report(tmp_path, summary_of([trial(1)]), None, "none")
     assert list(tmp_path.iterdir()) == []
 
 
