@@ -111,16 +111,17 @@ def report(options: argparse.Namespace) -> Path:
             return _report(run_dir, _summary(run_dir))
         for _, path in variants:
             _report(path, _summary(path))
-        return _compare(variants, run_dir, run_dir.resolve().name)
+        return _compare(variants, run_dir)
     runs = [run for path in directories for run in _variants(path) or [("", path)]]
     named = [(name or path.resolve().name, path) for name, path in runs]
     names = [name for name, _ in named]
     named = [(name if names.count(name) == 1 else str(path), path) for name, path in named]
     for _, path in named:
-        _summary(path)
-    again = options.out is not None and (options.out / "comparison.html").exists()
-    out = options.out if again else new_run_dir(options.out, "comparison")
-    return _compare(named, out, out.resolve().name)
+        _summary(path)  # Before anything is made.
+    there = sorted(path.name for path in options.out.iterdir()) if options.out and options.out.is_dir() else []
+    again = there == ["comparison.html", "plots"]
+    out = options.out.resolve() if again else new_run_dir(options.out, "comparison")
+    return _compare(named, out)
 
 
 def _summary(run_dir: Path) -> dict[str, Any]:
@@ -140,10 +141,11 @@ def _variants(run_dir: Path) -> list[tuple[str, Path]]:
     return [(name, run_dir / name) for name in names]
 
 
-def _compare(runs: list[tuple[str, Path]], out: Path, title: str) -> Path:
+def _compare(runs: list[tuple[str, Path]], out: Path) -> Path:
     from sim.comparison import NoRun, write_comparison
     from sim.plots import ReportUnavailable
 
+    title = ", ".join(dict.fromkeys(_summary(path)["scenario"] for _, path in runs))
     try:
         return write_comparison(runs, out, title)
     except (NoRun, ReportUnavailable) as error:

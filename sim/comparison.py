@@ -19,8 +19,6 @@ from sim.settings_table import differing
 
 FILE = "comparison.html"
 MAX_SETTINGS = 40
-BEST = 1.0005
-"""Figures within this factor of the best are as good."""
 
 
 class NoRun(ValueError):
@@ -186,12 +184,13 @@ def _figures(runs: list[Run]) -> str:
 
 
 def _best(figure: Figure, values: list[Any]) -> list[int]:
-    """Places of the best values, none if all are as good or the figure is not to be judged."""
+    """Places of the best values as they are shown, none if all are as good or the figure is not to be judged."""
     if figure.best is None:
         return []
-    scores = {place: figure.best(value) for place, value in enumerate(values) if value is not None}
-    limit = min(scores.values()) * BEST
-    found = [place for place, score in scores.items() if score <= limit]
+    scores = {
+        place: figure.best(round(value, figure.digits)) for place, value in enumerate(values) if value is not None
+    }
+    found = [place for place, score in scores.items() if score == min(scores.values())]
     return found if len(found) < len(scores) else []
 
 

@@ -57,8 +57,8 @@ pre { background: #f0f2f5; border-radius: 8px; padding: 12px 14px; margin: 8px 0
 a { color: var(--accent); }
 .stage { position: relative; cursor: pointer; border: 1px solid var(--line); border-radius: 8px; overflow: hidden; }
 .stage canvas { width: 100%; display: block; }
-.stage .big { position: absolute; left: 50%; top: 50%; width: 68px; height: 68px; margin: -34px 0 0 -34px; border: 0;
-  border-radius: 50%; background: var(--accent); color: #fff; font-size: 26px; padding: 0 0 0 5px; cursor: pointer;
+.stage .big { position: absolute; left: 22px; bottom: 34px; width: 60px; height: 60px; border: 0;
+  border-radius: 50%; background: var(--accent); color: #fff; font-size: 23px; padding: 0 0 0 5px; cursor: pointer;
   box-shadow: 0 2px 12px rgba(31, 36, 48, .3); }
 .stage .big[hidden] { display: none; }
 .bar { display: flex; gap: 14px; align-items: center; margin-top: 10px; font-size: 14px; color: var(--soft);

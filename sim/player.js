@@ -188,7 +188,7 @@
     for (const item of film.landmarks) {
       const [x, y] = [px(item.at[0]), py(item.at[1])];
       pen.fillStyle = GREY; pen.beginPath(); pen.moveTo(x, y - 6); pen.lineTo(x + 5.5, y + 4); pen.lineTo(x - 5.5, y + 4); pen.closePath(); pen.fill();
-      if (film.landmarks.length <= 20) write(item.name, x + 8, y + 4, GREY);
+      if (film.landmarks.length <= 8) write(item.name, x + 8, y + 4, GREY);
     }
     if (find(".paths").checked) {
       pen.strokeStyle = "#c9cdd5"; pen.lineWidth = 1;
@@ -285,5 +285,5 @@
     show();
   });
   for (const name of [".ellipses", ".paths", ".links"]) find(name).addEventListener("change", show);
-  new ResizeObserver(() => { resize(); show(); }).observe(canvas.parentElement);
+  new ResizeObserver(() => requestAnimationFrame(() => { resize(); show(); })).observe(canvas.parentElement);
 })();

@@ -100,16 +100,17 @@ def _end(runs: Runs) -> float:
 
 
 def _bounds(runs: Runs, key: str) -> list[tuple[int | None, list[float], Array]]:
-    """(run, times, RMSE) of each run's centralized filter, once with None for the run if they are all the same."""
-    found: list[tuple[int | None, list[float], Array]] = [
-        (index, series["t_s"], pooled(series[key].values(), root=True))
-        for index, (_, series) in enumerate(runs)
-        if series.get(key)
-    ]
-    first = found[:1]
-    if all(times == first[0][1] and np.allclose(line, first[0][2], equal_nan=True) for _, times, line in found):
-        return [(None, times, line) for _, times, line in first]
-    return found
+    """(run, times, RMSE) of the centralized filters, equal ones once, under the first run that has it.
+
+    If all are equal the run is None: it is nobody's own.
+    """
+    found: list[tuple[int | None, list[float], Array]] = []
+    for index, (_, series) in enumerate(runs):
+        if series.get(key):
+            t_s, line = series["t_s"], pooled(series[key].values(), root=True)
+            if not any(t_s == times and np.allclose(line, other, equal_nan=True) for _, times, other in found):
+                found.append((index, t_s, line))
+    return found if len(found) > 1 else [(None, t_s, line) for _, t_s, line in found]
 
 
 def _legend(figure: Any, axes: Any, runs: Runs, bounds: bool) -> None:

@@ -12,33 +12,38 @@ ABSENT = "–"
 def differing(trees: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
     """(dotted key, its value in each tree) of all keys that are not the same in all, in the order of the first tree.
 
-    Entries of arrays of tables go by their id. A key that has one value for all robots of a tree, in every tree, is
-    told once as `robots.*.key`.
+    Entries of arrays of tables go by their id, and which there are is a key of its own. A key that has one value for
+    all robots of a tree, in every tree, is told once as `robots.*.key`; one of a robot that only some trees have is not
+    told.
     """
     flat = [dict(_leaves(tree)) for tree in trees]
-    keys = list(dict.fromkeys(key for leaves in flat for key in leaves))
     found: dict[str, list[str]] = {}
-    for key in keys:
-        values = [leaves.get(key, ABSENT) for leaves in flat]
-        if len(set(values)) == 1:
-            continue
+    for key in dict.fromkeys(key for leaves in flat for key in leaves):
         whole = _for_all(key)
-        together = None if whole is None else _common(flat, whole)
-        if whole is not None and together is not None:
-            found.setdefault(whole, together)
-        else:
-            found[key] = values
-    return list(found.items())
+        if whole is not None:
+            together = _common(flat, whole)
+            if together is not None:
+                found.setdefault(whole, together)
+                continue
+            group, name, _ = key.split(".", 2)
+            if not all(name in leaves.get(group, "").split(", ") for leaves in flat):
+                continue
+        found[key] = [leaves.get(key, ABSENT) for leaves in flat]
+    return [(key, values) for key, values in found.items() if len(set(values)) > 1]
 
 
 def _leaves(value: Any, path: str = "") -> list[tuple[str, str]]:
+    found: list[tuple[str, str]] = []
     if isinstance(value, dict):
-        items = value.items()
+        items = value
     elif isinstance(value, list) and value and all(isinstance(item, dict) and "id" in item for item in value):
-        items = {str(item["id"]): item for item in value}.items()
+        items = {str(item["id"]): {key: below for key, below in item.items() if key != "id"} for item in value}
+        found.append((path, ", ".join(items)))
     else:
         return [(path, value if isinstance(value, str) else json.dumps(value))]
-    return [leaf for key, below in items for leaf in _leaves(below, f"{path}.{key}" if path else str(key))]
+    for key, below in items.items():
+        found += _leaves(below, f"{path}.{key}" if path else str(key))
+    return found
 
 
 def _for_all(key: str) -> str | None:

@@ -75,6 +75,9 @@ WRONG: list[tuple[list[str], str]] = [
     (["agent", "gone.toml"], "gone.toml: no such file"),
     (["replay", "gone.mcap"], "gone.mcap: no such file"),
     (["report", "gone"], "no readable summary.json"),
+    (["report", "gone", "lost"], "gone: no readable summary.json"),
+    (["report", "gone", "--out", "new"], "stays in its directory"),
+    (["report"], "DIR"),
 ]
 
 
@@ -188,6 +191,38 @@ def test_many_trials_leave_a_table_and_a_summary(desk: Desk) -> None:
     assert (summary(out)["trials"], summary(out)["seed"]) == (2, 5)
     rows = (desk.folder / "many" / "trials.csv").read_text().splitlines()
     assert [row.split(",")[:2] for row in rows[1:]] == [["0", "5"], ["1", "6"]]
+
+
+@pytest.mark.usefixtures("no_report")
+def test_runs_are_compared_on_one_page_that_can_be_written_again(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    compared: list[tuple[list[str], Path, str]] = []
+
+    def note(runs: list[tuple[str, Path]], out_dir: Path, title: str) -> Path:
+        compared.append(([name for name, _ in runs], out_dir, title))
+        (out_dir / "plots").mkdir(exist_ok=True)
+        (out_dir / "comparison.html").write_text(title)
+        return out_dir / "comparison.html"
+
+    monkeypatch.setattr("sim.comparison.write_comparison", note)
+    short = ["ut-clat", "--duration", "5", "--set", "window_s=[0,5]"]
+    for name in ("one", "two", "more/one"):
+        assert desk("run", *short, "--out", name)[0] == 0
+    vary = ["--vary", "links.loss=0,0.3", "--trials", "1", "--jobs", "1", "--out", "varied"]
+    assert desk("montecarlo", *short, *vary)[0] == 0
+    compared.clear()
+    for _ in range(2):
+        status, out, _ = desk("report", "one", "two", "more/one", "varied", "--out", "new")
+        assert (status, json.loads(out)) == (0, {"report": str(desk.folder / "new" / "comparison.html")})
+    assert compared[0] == (["one", "two", "more/one", "loss=0", "loss=0.3"], desk.folder / "new", "ut-clat")
+    for taken in ("more", "varied"):
+        status, _, err = desk("report", "one", "two", "--out", taken)
+        assert status == 2
+        assert f"{taken}: not empty" in err
+    status, out, _ = desk("report", "varied")
+    assert (status, json.loads(out)) == (0, {"report": "varied/comparison.html"})
+    assert compared[-1] == (["loss=0", "loss=0.3"], Path("varied"), "ut-clat")
+    assert desk("report", "one", "two")[0] == 0
+    assert compared[-1][1].name.startswith("comparison-")
 
 
 def test_a_run_has_a_report_that_can_be_written_again(desk: Desk) -> None:

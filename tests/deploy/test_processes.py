@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 
+from sim.store import load_trace
+
 SCENARIO = """
 version = 1
 name = "pair"
@@ -169,6 +171,12 @@ def test_processes_agree_with_virtual_time(tmp_path: Path) -> None:
     assert [packet for packet in shared if ours[packet] != theirs[packet]] == []
     lost = [packet for packet in shared if ours[packet][0] == "1"]
     assert 0.1 < len(lost) / len(shared) < 0.5
+    kept = [load_trace(folder) for folder in (run.directory, tmp_path / "virtual")]
+    measured = [stored.measured for stored in kept if stored is not None]
+    # The lower id owns a two-way range; one each step.
+    assert [list(found) for found in measured] == [[("r1", "r2")]] * 2
+    assert measured[0]["r1", "r2"].tolist() == measured[1]["r1", "r2"].tolist()
+    assert len(measured[0]["r1", "r2"]) == 80
     for name in ("summary.json", "report.html", "recording.mcap", "scenario.toml", "agents/r1.toml"):
         assert (run.directory / name).stat().st_size > 0
     replayed = subprocess.run(

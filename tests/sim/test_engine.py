@@ -124,6 +124,19 @@ def test_another_seed_is_another_run() -> None:
     assert not np.array_equal(one.trace.robots["r1"].mean, other.trace.robots["r1"].mean)
 
 
+def test_every_relative_measurement_the_world_offers_is_noted() -> None:
+    run = Run(scenario())
+    offered: dict[tuple[str, str], list[float]] = {}
+    for k in range(1, run.world.steps + 1):
+        for item in run.world.outputs(k):
+            if item.of is not None:
+                offered.setdefault((item.robot, item.of), []).append(item.t_ns * 1e-9)
+    assert ("r1", "target:t1") in offered
+    assert sorted(run.result.measured) == sorted(offered)
+    for key, times in offered.items():
+        np.testing.assert_allclose(run.result.measured[key], times)
+
+
 # --- order of events --------------------------------------------------------------------------------------
 
 
