@@ -40,7 +40,7 @@ def player(stored: Stored) -> str:
 <div class="bar"><label><input type="checkbox" class="ellipses" checked> 3σ</label>
 <label><input type="checkbox" class="paths" checked> true paths</label>
 <label><input type="checkbox" class="links" checked> measurements and contacts</label></div>
-<table class="now"></table>
+<div class="tall"><table class="now"></table></div>
 <script type="application/json">{data}</script>
 <script>{SCRIPT.read_text(encoding="utf-8")}</script></div>"""
     words = "Filled: where a robot believes to be, with its 3σ ellipse. Hollow: where it is."
@@ -58,15 +58,15 @@ def film(stored: Stored) -> dict[str, Any]:
     count = max(2, min(MAX_FRAMES, MAX_NUMBERS // (10 * max(1, len(states)))))
     frames = np.unique(np.linspace(0, len(trace.t_s) - 1, count).round().astype(int))
     end_s = float(trace.t_s[-1])
-    speeds = [speed for speed in SPEEDS if speed * 300.0 >= end_s / 4.0 or speed >= 1.0]
+    speed = min(SPEEDS, key=lambda speed: abs(np.log(speed * PLAYED_S / max(end_s, 1e-9))))
     gap_s = usual_gap(list(stored.measured.values()), end_s)
     contacts: dict[tuple[str, str], list[float]] = {}
     for t_s, a, b in stored.contacts:
         contacts.setdefault((min(a, b), max(a, b)), []).append(t_s)
     return {
         "t": [round(float(value), 3) for value in trace.t_s[frames]],
-        "speeds": speeds,
-        "speed": min(speeds, key=lambda speed: abs(np.log(speed * PLAYED_S / max(end_s, 1e-9)))),
+        "speeds": [item for item in SPEEDS if speed / 10.0 <= item <= speed * 10.0],
+        "speed": speed,
         "robots": [
             {"name": name, "colour": colour(index), **_frames(item, frames)}
             for index, (name, item) in enumerate(trace.robots.items())

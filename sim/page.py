@@ -13,6 +13,9 @@ from sim.plots import colour
 CONSISTENT = (0.5, 1.7)
 """ANEES and mean NIS within these are called consistent in words; the figure itself stands beside it."""
 
+TALL = 24
+"""Rows of a table that are all shown; in a longer one the reader scrolls."""
+
 STYLE = """
 :root { --ink: #1f2430; --soft: #5f6675; --line: #e3e6eb; --accent: #0072B2; --warn: #D55E00; --good: #007a58; }
 * { box-sizing: border-box; }
@@ -45,6 +48,7 @@ td.words { white-space: normal; overflow-wrap: anywhere; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
 th:last-child, td:last-child { padding-right: 0; }
 tr:last-child td { border-bottom: 0; }
+.tall { max-height: 640px; overflow-y: auto; }
 tr.total td { font-weight: 600; }
 tr.aside td { color: var(--soft); }
 i.dot { display: inline-block; width: 10px; height: 10px; border-radius: 50%; margin-right: 9px; }
@@ -144,7 +148,8 @@ def table(
     for index, row in enumerate(rows):
         mark = f' class="{classes[index]}"' if classes and classes[index] else ""
         body += f"<tr{mark}>" + "".join(_cell(cell) for cell in row) + "</tr>"
-    return f"<table>{head}{body}</table>"
+    whole = f"<table>{head}{body}</table>"
+    return f'<div class="tall">{whole}</div>' if len(rows) > TALL else whole
 
 
 def _cell(text: str) -> str:

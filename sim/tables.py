@@ -16,13 +16,15 @@ def robots(summary: dict[str, Any]) -> str:
     velocity = any("velocity_rmse_mps" in entry for entry in summary["robots"].values())
     header = ["", "position RMSE [m]", "max [m]", "at the end [m]", "heading RMSE [rad]"]
     header += ["velocity RMSE [m/s]"] if velocity else []
-    header += ["ANEES", "inside 3σ", "exit"]
+    ended = summary["runtime"] != "virtual" or any(summary["exit"].values())
+    header += ["ANEES", "inside 3σ", *(["exit"] if ended else [])]
 
     def row(name: str, entry: dict[str, Any], code: str) -> list[str]:
         cells = [name, number(entry.get("position_rmse_m"), 3), number(entry.get("position_error_max_m"), 2)]
         cells += [number(entry.get("final_position_error_m"), 2), number(entry.get("heading_rmse_rad"), 3)]
         cells += [number(entry.get("velocity_rmse_mps"), 3)] if velocity else []
-        return [*cells, number(entry.get("anees"), 2), number(entry.get("containment_3sigma"), 3), code]
+        cells += [number(entry.get("anees"), 2), number(entry.get("containment_3sigma"), 3)]
+        return [*cells, code] if ended else cells
 
     rows = [
         row(f"{index}|{name}", entry, str(summary["exit"].get(name, "–")))
@@ -72,7 +74,7 @@ def extreme(entry: dict[str, Any], name: str, trials: int) -> str:
     """Smallest and largest error of a component; over trials the median and the worst of the largest."""
     first, last = ("error_max", "error_worst") if trials > 1 else ("error_min", "error_max")
     values = [(entry.get(key) or {}).get(name) for key in (first, last)]
-    return " / ".join(number(value, 2) for value in values)
+    return "–" if values == [None, None] else " / ".join(number(value, 2) for value in values)
 
 
 def extremes(summary: dict[str, Any]) -> str:
