@@ -64,7 +64,7 @@ class InitialPart(Part):
 class AgentSensorPart(Part):
     """A sensor as the estimator knows it; the covariance comes with every measurement."""
 
-    kind: Literal["range", "bearing", "range_bearing", "position", "pose", "heading", "odometry"]
+    kind: Literal["range", "bearing", "range_bearing", "vector", "position", "pose", "heading", "odometry"]
     mount: Vector3 = [0.0, 0.0, 0.0]
     two_way: bool = True
 

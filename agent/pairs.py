@@ -280,7 +280,12 @@ class Pairs:
             return item
         moved = (self._settings.coast.speed_mps * sigma_s) ** 2
         reach = max(float(item.z[0]), 1.0) if item.kind == "range_bearing" else 1.0
-        extra = {"range": [moved], "bearing": [moved / reach**2], "range_bearing": [moved, moved / reach**2]}
+        extra = {
+            "range": [moved],
+            "bearing": [moved / reach**2],
+            "range_bearing": [moved, moved / reach**2],
+            "vector": [moved, moved],
+        }
         return replace(item, R=item.R + np.diag(extra[item.kind]))
 
     def _apply(

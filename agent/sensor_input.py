@@ -2,8 +2,8 @@
 
     {"t_ns": int, "kind": "range", "of": "r2" | "landmark:L3" | "target:t1" | None, "z": [4.21], "R": [[0.0025]]}
 
-kinds `range`, `bearing` (azimuth), `range_bearing`, `position`, `pose`, `heading`, and `odometry` (z = dx, dy, dz,
-dyaw over [t0_ns, t_ns]). Optional: "sensor" (its name in the config), "t0_ns" (odometry only). SI and radians,
+kinds `range`, `bearing` (azimuth), `range_bearing`, `vector` (x, y in the sensor's frame), `position`, `pose`,
+`heading`, and `odometry` (z = dx, dy, dz, dyaw over [t0_ns, t_ns]). Optional: "sensor" (its name in the config), "t0_ns" (odometry only). SI and radians,
 frames as in `agent.events`.
 """
 
@@ -30,6 +30,7 @@ SIZES = {
     "range": 1,
     "bearing": 1,
     "range_bearing": 2,
+    "vector": 2,
     "position": 2,
     "pose": 3,
     "heading": 1,
@@ -115,7 +116,7 @@ def decode(payload: bytes, now_ns: int, sensors: dict[str, SensorConfig]) -> Eve
         raise SensorError("not_positive_definite")
     if kind in ABSOLUTE_KINDS:
         return Fix(now_ns, t_ns, kind, z, R, sensor)
-    if kind != "bearing" and z[0] < 0.0:
+    if kind in ("range", "range_bearing") and z[0] < 0.0:
         raise SensorError("out_of_range")
     mount = sensors[sensor].mount if sensor in sensors else (0.0, 0.0, 0.0)
     return Observation(now_ns, t_ns, kind, of, z, R, sensor, mount)

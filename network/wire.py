@@ -42,8 +42,8 @@ from network.messages import (
     TargetBelief,
 )
 
-MODEL_DIMS = {"unicycle": 3, "constant_velocity": 4, "damped_velocity": 4}
-MEASUREMENT_DIMS = {"range": 1, "bearing": 1, "range_bearing": 2}
+MODEL_DIMS = {"unicycle": 3, "unicycle_gains": 5, "constant_velocity": 4, "damped_velocity": 4}
+MEASUREMENT_DIMS = {"range": 1, "bearing": 1, "range_bearing": 2, "vector": 2}
 
 MAX_INT = 2**63 - 1
 MAX_ABS = 1e9

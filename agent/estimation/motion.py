@@ -33,10 +33,11 @@ class StateLayout:
 
 
 UNICYCLE = StateLayout("unicycle", 3, (2,), 2)
+UNICYCLE_GAINS = StateLayout("unicycle_gains", 5, (2,), 2)
 CONSTANT_VELOCITY = StateLayout("constant_velocity", 4, (), None)
 DAMPED_VELOCITY = StateLayout("damped_velocity", 4, (), None)
 
-LAYOUTS = {layout.name: layout for layout in (UNICYCLE, CONSTANT_VELOCITY, DAMPED_VELOCITY)}
+LAYOUTS = {layout.name: layout for layout in (UNICYCLE, UNICYCLE_GAINS, CONSTANT_VELOCITY, DAMPED_VELOCITY)}
 
 
 def compose(pose: Array, delta: Array) -> Array:

@@ -16,7 +16,7 @@ from agent.estimation.motion import StateLayout
 
 Array = NDArray[np.float64]
 
-RELATIVE_ANGLES: dict[str, tuple[int, ...]] = {"range": (), "bearing": (0,), "range_bearing": (1,)}
+RELATIVE_ANGLES: dict[str, tuple[int, ...]] = {"range": (), "bearing": (0,), "range_bearing": (1,), "vector": ()}
 """Kinds of relative measurement and their wrapped components."""
 
 ABSOLUTE: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
@@ -53,7 +53,7 @@ class AbsoluteModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativeModel:
-    """Range [m], bearing [rad] or both from an observer to a subject.
+    """Range [m], bearing [rad] or both from an observer to a subject, or the `vector` x, y [m] in the sensor's frame.
 
     The stacked state is [observer; subject], the subject's position being its first two components, or
     `landmark` (2,) when given (the stack is then the observer alone). `mount` is the sensor's lever arm x, y
@@ -85,9 +85,17 @@ class RelativeModel:
             lever = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
         return subject - state[..., :2] - lever, lever
 
+    def _turn(self, state: Array) -> Array:
+        """Rotation (..., 2, 2) from ENU into the sensor's frame."""
+        angle = state[..., 2] + self.mount[2]
+        cos, sin = np.cos(angle), np.sin(angle)
+        return np.stack([np.stack([cos, sin], axis=-1), np.stack([-sin, cos], axis=-1)], axis=-2)
+
     def h(self, state: Array) -> Array:
         """Measurement (..., m) of a stacked state (..., n)."""
         d, _ = self._geometry(state)
+        if self.kind == "vector":
+            return np.asarray((self._turn(state) @ d[..., None])[..., 0])
         distance = np.hypot(d[..., 0], d[..., 1])
         if self.kind == "range":
             return np.asarray(distance[..., None])
@@ -100,6 +108,15 @@ class RelativeModel:
         """H (..., m, n). Distances below 1 mm are taken as 1 mm: the bearing is undefined at the sensor."""
         d, lever = self._geometry(state)
         n = state.shape[-1]
+        if self.kind == "vector":
+            turn = self._turn(state)
+            H = np.zeros((*state.shape[:-1], 2, n))
+            H[..., :2] = -turn
+            if self.landmark is None:
+                H[..., self.observer.dim : self.observer.dim + 2] = turn
+            seen = (turn @ (d + lever)[..., None])[..., 0]
+            H[..., 0, 2], H[..., 1, 2] = seen[..., 1], -seen[..., 0]
+            return H
         distance = np.maximum(np.hypot(d[..., 0], d[..., 1]), 1e-3)
         unit = d / distance[..., None]
         normal = np.stack([-unit[..., 1], unit[..., 0]], axis=-1) / distance[..., None]

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from agent.estimation.observation import RELATIVE_ANGLES
 from agent.events import Fix, Observation, Odometry
 from agent.sensor_input import (
     ABSOLUTE_KINDS,
@@ -31,7 +32,7 @@ def measurement(kind: str, **change: Any) -> dict[str, Any]:
     data: dict[str, Any] = {
         "t_ns": 1_000,
         "kind": kind,
-        "of": "r2" if kind in ("range", "bearing", "range_bearing") else None,
+        "of": "r2" if kind in RELATIVE_ANGLES else None,
         "z": [0.5 + index for index in range(size)],
         "R": [[0.25 if row == column else 0.0 for column in range(size)] for row in range(size)],
     }
@@ -60,7 +61,7 @@ def test_every_kind_arrives_as_it_was_sent(kind: str) -> None:
     root = np.tril(np.linspace(0.1, 1.0, size * size).reshape(size, size))
     R = root @ root.T
     R = (R + R.T) / 2.0
-    relative = kind in ("range", "bearing", "range_bearing")
+    relative = kind in RELATIVE_ANGLES
     of = "landmark:L-3.b" if relative else None
     t0_ns = 600 if kind == "odometry" else None
     event = decode(encode(1_000, kind, z, R, of=of, sensor="uwb", t0_ns=t0_ns), NOW, SENSORS)

@@ -224,6 +224,7 @@ def test_drift_of_a_unicycle_covers_targets_driven_at_random() -> None:
 def test_layouts_are_known_by_their_names() -> None:
     assert {name: (layout.dim, layout.angles, layout.heading) for name, layout in LAYOUTS.items()} == {
         "unicycle": (3, (2,), 2),
+        "unicycle_gains": (5, (2,), 2),
         "constant_velocity": (4, (), None),
         "damped_velocity": (4, (), None),
     }

@@ -168,3 +168,13 @@ def test_absolute_information_selects_components(kind: str, dim: int) -> None:
     assert np.array_equal(model.jacobian(state), np.eye(dim)[list(components)])
     assert model.jacobian(np.stack([state, state])).shape == (2, len(components), dim)
     assert [components[index] for index in angles] == [index for index in components if index == 2]
+
+
+@given(MOUNT, METRE, METRE, HEADING, METRE, METRE)
+def test_a_vector_is_range_and_bearing_in_cartesian_form(
+    mount: tuple[float, float, float], x: float, y: float, heading: float, east: float, north: float
+) -> None:
+    state = np.array([x, y, heading, east, north])
+    distance, bearing = RelativeModel("range_bearing", UNICYCLE, mount).h(state)
+    vector = RelativeModel("vector", UNICYCLE, mount).h(state)
+    assert np.allclose(vector, [distance * math.cos(bearing), distance * math.sin(bearing)], atol=1e-9)
