@@ -429,7 +429,9 @@ class AutopilotReader:
         noise = self._settings.odometry_noise
         delta = noise.calibrated(increment.delta)
         seconds = (increment.t1_ns - increment.t0_ns) * 1e-9
-        return Odometry(now_ns, increment.t0_ns, increment.t1_ns, delta, noise.covariance(delta, seconds))
+        lag_ns = round(noise.lag_s * 1e9)
+        t0_ns, t1_ns = increment.t0_ns + lag_ns, increment.t1_ns + lag_ns
+        return Odometry(now_ns, t0_ns, t1_ns, delta, noise.covariance(delta, seconds))
 
     # -- for people -----------------------------------------------------------------------------------------
 

@@ -6,12 +6,13 @@ import re
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import Field
 
 from agent.autopilot import AutopilotSettings
+from agent.calibration import NO_CALIBRATION, Form
 from agent.config_file import (
     ConfigError,
+    Finite,
     Id,
     NotNegative,
     Part,
@@ -22,11 +23,13 @@ from agent.config_file import (
 )
 from agent.config_parts import (
     AgentTargetPart,
+    CalibrationPart,
     CoastPart,
     LandmarkPart,
     LatenessPart,
     LinksPart,
     LocalizationPart,
+    MotionPart,
     NetworkPart,
     OdometryPart,
     SigmaPart,
@@ -57,7 +60,7 @@ class InitialPart(Part):
     """Initial belief and where it comes from."""
 
     source: Literal["survey"] = "survey"
-    mean: Vector3
+    mean: Annotated[list[Finite], Field(min_length=3, max_length=8)]
     start_sigma: SigmaPart
 
 
@@ -67,6 +70,14 @@ class AgentSensorPart(Part):
     kind: Literal["range", "bearing", "range_bearing", "vector", "position", "pose", "heading", "odometry"]
     mount: Vector3 = [0.0, 0.0, 0.0]
     two_way: bool = True
+    calibration: CalibrationPart = CalibrationPart()
+    lag_s: Finite = 0.0
+    form: Form = "polar"
+
+    def settings(self) -> SensorConfig:
+        calibration = NO_CALIBRATION if self.calibration == CalibrationPart() else self.calibration.settings()
+        x, y, yaw = self.mount
+        return SensorConfig((x, y, yaw), calibration, nanoseconds(self.lag_s), self.form)
 
 
 class PeerPart(Part):
@@ -139,6 +150,7 @@ class AgentConfig(Part):
     origin: Vector3 = [0.0, 0.0, 0.0]
     clock: ClockPart = ClockPart()
     initial: InitialPart
+    motion: MotionPart = MotionPart()
     localization: LocalizationPart = LocalizationPart()
     tracking: TrackingPart = TrackingPart()
     lateness: LatenessPart = LatenessPart()
@@ -159,8 +171,9 @@ class AgentConfig(Part):
         return AgentSettings(
             robot=self.identity.robot,
             start_ns=start_ns,
-            mean=np.array(self.initial.mean),
-            cov=self.initial.start_sigma.covariance("unicycle"),
+            mean=self.motion.completed(self.initial.mean),
+            cov=self.initial.start_sigma.covariance(self.motion.model),
+            motion=self.motion.settings(),
             targets=tuple(target.settings() for target in self.targets),
             landmarks={item.id: (item.position[0], item.position[1]) for item in self.landmarks},
             one_way_sensors=tuple(name for name, part in sorted(self.sensors.items()) if not part.two_way),
@@ -171,9 +184,7 @@ class AgentConfig(Part):
         )
 
     def sensor_configs(self) -> dict[str, SensorConfig]:
-        return {
-            name: SensorConfig((part.mount[0], part.mount[1], part.mount[2])) for name, part in self.sensors.items()
-        }
+        return {name: part.settings() for name, part in self.sensors.items()}
 
 
 def load_agent_config(path: Path) -> AgentConfig:
@@ -185,7 +196,8 @@ def load_agent_config(path: Path) -> AgentConfig:
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     try:
-        config.initial.start_sigma.covariance("unicycle")
+        config.motion.completed(config.initial.mean)
+        config.initial.start_sigma.covariance(config.motion.model)
     except ConfigError as error:
         raise ConfigError(f"{path}: initial.{error}") from None
     for name, ids in (

@@ -6,8 +6,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from agent.calibration import Calibration
 from agent.config_file import ConfigError, Finite, Id, LandmarkId, NotNegative, Part, Positive, Share, Vector2
-from agent.estimation.motion import LAYOUTS, TargetMotion
+from agent.estimation.gain_motion import GainMotion
+from agent.estimation.motion import LAYOUTS, RobotMotion, TargetMotion
 from agent.estimation.odometry import OdometryNoise
 from agent.settings import CoastSettings, LatenessSettings, LocalizationSettings, TargetSettings, nanoseconds
 from network.endpoint import EndpointSettings
@@ -102,15 +104,44 @@ class SigmaPart(Part):
     position_m: Positive
     heading_rad: Positive | None = None
     velocity_mps: Positive | None = None
+    gain_along: Positive | None = None
+    gain_turn: Positive | None = None
 
     def covariance(self, model: str) -> np.ndarray[Any, np.dtype[np.float64]]:
         """Diagonal covariance of a state of `model`."""
-        layout = LAYOUTS[model]
-        rest = self.heading_rad if layout.heading is not None else self.velocity_mps
-        if rest is None:
-            key = "heading_rad" if layout.heading is not None else "velocity_mps"
-            raise ConfigError(f"start_sigma.{key} is missing: the model '{model}' needs it")
-        return np.diag([self.position_m**2] * 2 + [rest**2] * (layout.dim - 2))
+        keys = {
+            "unicycle": ["heading_rad"],
+            "unicycle_gains": ["heading_rad", "gain_along", "gain_turn"],
+        }.get(model, ["velocity_mps", "velocity_mps"])
+        sigmas = [self.position_m, self.position_m]
+        for key in keys:
+            sigma = getattr(self, key)
+            if sigma is None:
+                raise ConfigError(f"start_sigma.{key} is missing: the model '{model}' needs it")
+            sigmas.append(sigma)
+        return np.diag(np.square(sigmas))
+
+
+RobotModel = Literal["unicycle", "unicycle_gains"]
+
+
+class MotionPart(Part):
+    """How the robot moves with its odometry; the gains of `unicycle_gains` wander by `gain_walk_per_sqrt_s`."""
+
+    model: RobotModel = "unicycle"
+    gain_walk_per_sqrt_s: NotNegative = 0.003
+
+    def settings(self) -> RobotMotion:
+        if self.model == "unicycle_gains":
+            return GainMotion(walk=self.gain_walk_per_sqrt_s)
+        return RobotMotion(LAYOUTS[self.model])
+
+    def completed(self, mean: list[float]) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """An initial mean; of a pose alone the gains are 1. Raises `ConfigError` for another size."""
+        dim = LAYOUTS[self.model].dim
+        if len(mean) not in (3, dim):
+            raise ConfigError(f"mean needs 3 numbers{f' or {dim}' if dim != 3 else ''} for the model '{self.model}'")
+        return np.array([*mean, *[1.0] * (dim - len(mean))])
 
 
 class ControlPart(Part):
@@ -137,9 +168,23 @@ class OdometryPart(Part):
     heading_rad_per_sqrt_rad: NotNegative = 0.0
     scale_along: Positive = 1.0
     scale_turn: Positive = 1.0
+    lag_s: Finite = 0.0
 
     def noise(self) -> OdometryNoise:
         return OdometryNoise(**self.model_dump())
+
+
+class CalibrationPart(Part):
+    """Systematic errors of a sensor; see `agent.calibration`."""
+
+    bias_m: Finite = 0.0
+    bias_of: dict[str, Finite] = {}
+    scale: Positive = 1.0
+    depth: bool = False
+    bias_rad: Finite = 0.0
+
+    def settings(self) -> Calibration:
+        return Calibration(self.bias_m, dict(self.bias_of), self.scale, self.depth, self.bias_rad)
 
 
 class AgentTargetPart(Part):

@@ -51,7 +51,8 @@ class Observation:
     """A relative measurement of a subject: `r2`, `landmark:L3`, `target:t1`, or None (identity unknown).
 
     kinds `range` (m), `bearing` (rad), `range_bearing` (m, rad), `vector` (x, y in m, forward and left); bearings are
-    counter-clockwise from the sensor's forward axis. `mount`: lever arm x, y [m, FLU] and yaw [rad] of the sensor on the body.
+    counter-clockwise from the sensor's forward axis. `mount`: lever arm x, y [m, FLU] and yaw [rad] of the sensor on
+    the body.
     """
 
     t_ns: int

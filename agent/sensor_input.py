@@ -3,8 +3,8 @@
     {"t_ns": int, "kind": "range", "of": "r2" | "landmark:L3" | "target:t1" | None, "z": [4.21], "R": [[0.0025]]}
 
 kinds `range`, `bearing` (azimuth), `range_bearing`, `vector` (x, y in the sensor's frame), `position`, `pose`,
-`heading`, and `odometry` (z = dx, dy, dz, dyaw over [t0_ns, t_ns]). Optional: "sensor" (its name in the config), "t0_ns" (odometry only). SI and radians,
-frames as in `agent.events`.
+`heading`, and `odometry` (z = dx, dy, dz, dyaw over [t0_ns, t_ns]). Optional: "sensor" (its name in the config),
+"t0_ns" (odometry only). SI and radians, frames as in `agent.events`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.calibration import NO_CALIBRATION, Calibration, Form, corrected, formed
 from agent.estimation.gaussian import is_positive_definite
 from agent.events import Event, Fix, Observation, Odometry
 
@@ -53,9 +54,26 @@ class SensorError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class SensorConfig:
-    """What the robot knows of one of its sensors: where it sits on the body."""
+    """What the robot knows of one of its sensors.
+
+    mount         where it sits on the body: x, y [m, FLU], yaw [rad]
+    calibration   its systematic errors
+    lag_ns        how much later than the instant of a measurement its stamp is
+    form          how a range with a bearing is used
+    """
 
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    calibration: Calibration = NO_CALIBRATION
+    lag_ns: int = 0
+    form: Form = "polar"
+
+    def reading(self, kind: str, of: str | None, z: Array, R: Array) -> tuple[str, Array, Array]:
+        """(kind, z, R) of a measurement as it is used."""
+        return formed(kind, corrected(kind, of, z, self.calibration), R, self.form)
+
+
+PLAIN = SensorConfig()
+"""A sensor of which nothing is known."""
 
 
 def encode(
@@ -96,6 +114,8 @@ def decode(payload: bytes, now_ns: int, sensors: dict[str, SensorConfig]) -> Eve
     sensor = data.get("sensor", "")
     if type(sensor) is not str or (sensor and not _SENSOR.match(sensor)):
         raise SensorError("malformed")
+    config = sensors.get(sensor, PLAIN)
+    t_ns -= config.lag_ns
     size = SIZES[kind]
     z = _array(data.get("z"), (size,))
     R = _array(data.get("R"), (size, size))
@@ -106,7 +126,7 @@ def decode(payload: bytes, now_ns: int, sensors: dict[str, SensorConfig]) -> Eve
     if not np.array_equal(R, R.T):
         raise SensorError("not_positive_definite")
     if kind == "odometry":
-        t0_ns = _stamp(data.get("t0_ns"))
+        t0_ns = _stamp(data.get("t0_ns")) - config.lag_ns
         if t0_ns >= t_ns:
             raise SensorError("bad_interval")
         if np.any(np.diagonal(R) < 0.0) or not is_positive_definite(R + np.eye(size) * FLOOR):
@@ -118,8 +138,8 @@ def decode(payload: bytes, now_ns: int, sensors: dict[str, SensorConfig]) -> Eve
         return Fix(now_ns, t_ns, kind, z, R, sensor)
     if kind in ("range", "range_bearing") and z[0] < 0.0:
         raise SensorError("out_of_range")
-    mount = sensors[sensor].mount if sensor in sensors else (0.0, 0.0, 0.0)
-    return Observation(now_ns, t_ns, kind, of, z, R, sensor, mount)
+    kind, z, R = config.reading(kind, of, z, R)
+    return Observation(now_ns, t_ns, kind, of, z, R, sensor, config.mount)
 
 
 def _stamp(value: Any) -> int:

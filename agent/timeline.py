@@ -74,6 +74,12 @@ class OdometryTrack:
         self._increments: deque[Odometry] = deque()
         self._gap_ns: tuple[int, int] | None = None
 
+    def copy(self) -> OdometryTrack:
+        """A track of its own with the same increments."""
+        other = OdometryTrack(self._coast, self._tolerance_ns, self._counters)
+        other._increments, other._gap_ns = deque(self._increments), self._gap_ns
+        return other
+
     @property
     def end_ns(self) -> int | None:
         """Last instant covered by a waiting increment; None when there is none."""

@@ -44,13 +44,21 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
             "mean": [float(value) for value in mean],
             "start_sigma": table(robot.start_sigma),
         },
+        "motion": {"model": robot.model, "gain_walk_per_sqrt_s": robot.gain_walk_per_sqrt_s},
         "localization": table(scenario.localization_of(robot)),
         "tracking": table(scenario.tracking_of(robot)),
         "lateness": table(scenario.lateness_of(robot)),
         "coast": table(scenario.coast),
         "network": table(scenario.network),
         "sensors": {
-            name: {"kind": sensor_kind(name, sensor), "mount": list(sensor.mount), "two_way": sensor.two_way}
+            name: {
+                "kind": sensor_kind(name, sensor),
+                "mount": list(sensor.mount),
+                "two_way": sensor.two_way,
+                "calibration": table(sensor.calibration),
+                "lag_s": sensor.lag_s,
+                "form": sensor.form,
+            }
             for name, sensor in robot.sensors.items()
         },
         "targets": targets,

@@ -6,6 +6,8 @@ statistically over the states they involve only, K = P[:, sub] H^T S^-1 with S =
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -44,6 +46,12 @@ class CentralizedFilter:
             angles += [offset + index for index in layout.angles]
             offset += len(mean)
         self._angles = tuple(angles)
+
+    def copy(self) -> CentralizedFilter:
+        """A filter of its own with the same belief."""
+        other = copy.copy(self)
+        other.mean, other.cov = self.mean.copy(), self.cov.copy()
+        return other
 
     def belief(self, name: str) -> tuple[Array, Array]:
         """Marginal mean (n,) and covariance (n, n)."""

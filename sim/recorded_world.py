@@ -9,78 +9,143 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.config_file import ConfigError
+from agent.estimation.gaussian import wrap_components
+from agent.estimation.motion import LAYOUTS
+from agent.estimation.observation import ABSOLUTE, RELATIVE_ANGLES
 from agent.settings import NS, nanoseconds
 from agent.timeline import Phase
-from sim.recordings.utias import Recording, load
+from sim.noise import normal_rows
+from sim.recordings import tiers, utias
+from sim.recordings.recording import Recording
 from sim.scenario import RobotPart, Scenario, SensorPart, sensor_kind
-from sim.world import Output, control_odometry, drawn_belief, order, phase_of, relative_noise
+from sim.world import Output, absolute_noise, control_odometry, drawn_belief, order, phase_of, relative_noise
 
 Array = NDArray[np.float64]
 
+LOADERS = {"utias": utias.load, "tiers": tiers.load}
 
-@lru_cache(maxsize=1)
-def _read(path: str, stamp_ns: int) -> Recording:
+
+@lru_cache(maxsize=2)
+def _read(format_: str, path: str, stamp_ns: int) -> Recording:
     """The recording as it was at `stamp_ns`; many trials read it once."""
-    return load(path)
+    return LOADERS[format_](path)
 
 
 def _stamp_ns(path: str) -> int:
-    """When anything in the folder was last changed; 0 without it."""
-    folder = Path(path)
-    files = [folder, *folder.iterdir()] if folder.is_dir() else []
-    return max((item.stat().st_mtime_ns for item in files), default=0)
+    """When the file, or anything in the folder, was last changed; 0 without it."""
+    place = Path(path)
+    files = [place, *place.iterdir()] if place.is_dir() else [place]
+    return max((item.stat().st_mtime_ns for item in files if item.exists()), default=0)
 
 
 class RecordedWorld:
-    """A UTIAS MR.CLAM recording as a `World`. Instant 0 is the start of the span all robots have in common.
+    """A recording as a `World`. Instant 0 is the start of the span all its robots have in common.
 
-    Odometry is integrated from the commanded velocities over each step; sightings keep their stamps, and each
-    robot uses those its sensors name (`of`), with the covariance the sensor states.
+    Odometry is integrated over each step from the commanded velocities of `odometry.lag_s` ago; where none was
+    recorded it is the true motion with drawn noise. Sightings keep their stamps, and each robot uses those its sensors
+    name (`of`), with the covariance the sensor states; fixes are drawn around the truth. Where the recording has no
+    truth, truth is NaN. A target is a robot of the recording that takes part in nothing.
     """
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
         path = scenario.world.path
         assert path is not None
-        self._recording: Recording = _read(path, _stamp_ns(path))
+        self._recording = _read(scenario.world.format, path, _stamp_ns(path))
         self._scenario, self._seed = scenario, seed
-        missing = [robot.id for robot in scenario.robots if robot.id not in self._recording.robots]
-        if missing:
-            raise ConfigError(
-                f"{path}: the recording has no odometry of robot {missing[0]}; remove it from the scenario's robots"
-            )
-        unknown = [r.id for r in scenario.robots if self._recording.robots[r.id].truth is None]
-        if unknown:
-            raise ConfigError(f"{path}: the recording has no ground truth of robot {unknown[0]}, which a run needs")
         self.robots = tuple(robot.id for robot in scenario.robots)
-        self.targets: tuple[str, ...] = ()
+        self.targets = tuple(target.id for target in scenario.targets)
         self.landmarks = dict(self._recording.landmarks)
         self.step_ns = nanoseconds(scenario.step_s)
         self._start_ns = self._recording.start_ns
+        self._check(path)
         span = min(round(scenario.duration_s * NS), self._recording.end_ns - self._start_ns)
         self.steps = int(span // self.step_ns)
+        self._noise: dict[tuple[str, str], Array] = {}
+
+    def _check(self, path: str) -> None:
+        """Raises `ConfigError` for what the recording does not hold."""
+        for name in (*self.robots, *self.targets):
+            if name not in self._recording.robots:
+                raise ConfigError(
+                    f"{path}: the recording has no data of robot {name}; there are: {', '.join(self._recording.robots)}"
+                )
+        for robot in self._scenario.robots:
+            recorded = self._recording.robots[robot.id]
+            if recorded.truth is not None:
+                continue
+            if recorded.odometry is None:
+                raise ConfigError(f"{path}: the recording has neither odometry nor ground truth of robot {robot.id}")
+            if robot.start.pose is None:
+                raise ConfigError(
+                    f"{path}: the recording has no ground truth of robot {robot.id}: say where it starts, "
+                    f"--set 'robots.{robot.id}.start.pose=[X, Y, HEADING]', and how sure that is with start_sigma"
+                )
+            fixes = [name for name, sensor in robot.sensors.items() if sensor_kind(name, sensor) in ABSOLUTE]
+            if fixes:
+                raise ConfigError(
+                    f"{path}: the recording has no ground truth of robot {robot.id} to make fixes of; remove "
+                    f"robots.{robot.id}.sensors.{fixes[0]}"
+                )
+        for target in self._scenario.targets:
+            pose = target.start.pose
+            if self._recording.robots[target.id].truth is None and (pose is None or len(pose) != 4):
+                raise ConfigError(
+                    f"{path}: the recording has no ground truth of {target.id}: set targets.{target.id}.start.pose to "
+                    "x, y and velocity"
+                )
+
+    def _known(self, entity: str) -> bool:
+        return self._recording.robots[entity].truth is not None
 
     def start_belief(self, entity: str) -> tuple[Array, Array]:
-        part = next(robot for robot in self._scenario.robots if robot.id == entity)
-        return drawn_belief(self.truth(entity, 0), part.start_sigma.covariance(part.model), self._seed, entity)
+        part = self._scenario.movers()[entity]
+        cov = part.start_sigma.covariance(part.model)
+        if self._known(entity):
+            truth = self.truth(entity, 0)
+            return drawn_belief(truth, cov, self._seed, entity, LAYOUTS[part.model].angles)
+        assert part.start.pose is not None
+        return np.append(part.start.pose, np.ones(len(cov) - len(part.start.pose))), cov
 
     def truth(self, entity: str, k: int) -> Array:
-        return np.array(self._recording.truth_at(entity, self._start_ns + k * self.step_ns))
+        """Pose (3,) of a robot, position and velocity (4,) of a target; NaN where nobody measured it."""
+        t_ns = self._start_ns + k * self.step_ns
+        if not self._known(entity):
+            return np.full(4 if entity in self.targets else 3, np.nan)
+        pose = self._recording.truth_at(entity, t_ns)
+        if entity in self.targets:
+            return np.append(pose[:2], self._recording.velocity_at(entity, t_ns))
+        return pose
 
     def outputs(self, k: int) -> list[Output]:
         found: list[Output] = []
         for robot in self._scenario.robots:
             found.append(self._odometry(robot, k))
             found.extend(self._sightings(robot, k))
+            found.extend(self._fixes(robot, k))
         found.sort(key=order)
         return found
 
+    def _drawn(self, robot: str, name: str, size: int, k: int) -> Array:
+        """Standard normal numbers (size,) of a robot's sensor for instant k."""
+        if (robot, name) not in self._noise:
+            self._noise[robot, name] = normal_rows(self._seed, self.steps + 1, size, robot, name)
+        return np.asarray(self._noise[robot, name][k])
+
     def _odometry(self, robot: RobotPart, k: int) -> Output:
+        noise, dt_s = control_odometry(robot, self._scenario.step_s), self._scenario.step_s
         t1_ns = k * self.step_ns
         t0_ns = t1_ns - self.step_ns
-        dx, dy, dyaw = self._recording.increment(robot.id, self._start_ns + t0_ns, self._start_ns + t1_ns)
-        noise = control_odometry(robot, self._scenario.step_s)
-        delta = noise.calibrated(np.array([dx, dy, 0.0, dyaw]))
-        cov = noise.covariance(delta, self.step_ns * 1e-9)
+        lag_ns = nanoseconds(noise.lag_s)
+        begin, end = self._start_ns + t0_ns - lag_ns, self._start_ns + t1_ns - lag_ns
+        if self._recording.robots[robot.id].odometry is None:
+            dx, dy, dyaw = self._recording.increment(robot.id, self._start_ns + t0_ns, self._start_ns + t1_ns)
+            true = np.array([dx, dy, 0.0, dyaw])
+            cov = noise.covariance(true, dt_s)
+            delta = true + np.sqrt(np.diagonal(cov)) * self._drawn(robot.id, "odometry", 4, k)
+        else:
+            dx, dy, dyaw = self._recording.increment(robot.id, begin, end)
+            delta = noise.calibrated(np.array([dx, dy, 0.0, dyaw]))
+            cov = noise.covariance(delta, dt_s)
         return Output(t1_ns, Phase.PREDICT, robot.id, "odometry", "odometry", None, delta, cov, t0_ns)
 
     def _sightings(self, robot: RobotPart, k: int) -> list[Output]:
@@ -90,23 +155,50 @@ class RecordedWorld:
         high = int(np.searchsorted(sightings.t_ns, until, side="right"))
         outputs = []
         for index in range(low, high):
-            subject = sightings.subject[index]
-            peer = subject in self._recording.robots
-            of = subject if peer else f"landmark:{subject}"
-            if peer and subject not in self.robots:
+            what, of = self._named(sightings.subject[index])
+            if of is None:
                 continue
+            range_m, bearing_rad = float(sightings.range_m[index]), float(sightings.bearing_rad[index])
             for name, sensor in robot.sensors.items():
-                if ("peers" if peer else "landmarks") not in sensor.of:
+                if what not in sensor.of or (sensor.max_range_m is not None and range_m > sensor.max_range_m):
                     continue
-                z, R = self._measured(
-                    name, sensor, float(sightings.range_m[index]), float(sightings.bearing_rad[index])
-                )
+                kind = sensor_kind(name, sensor)
+                # A two-way range is measured by both; the lower id uses its own.
+                if what == "peers" and kind == "range" and sensor.two_way and of < robot.id:
+                    continue
+                z, R = self._measured(kind, sensor, range_m, bearing_rad)
                 t_ns = int(sightings.t_ns[index]) - self._start_ns
-                outputs.append(Output(t_ns, phase_of(of), robot.id, name, sensor_kind(name, sensor), of, z, R))
+                outputs.append(Output(t_ns, phase_of(of), robot.id, name, kind, of, z, R))
         return outputs
 
+    def _named(self, subject: str) -> tuple[str, str | None]:
+        """What a subject of the recording is in this scenario, and its name; None: nothing."""
+        if subject in self.targets:
+            return "targets", f"target:{subject}"
+        if subject in self._recording.robots:
+            return "peers", subject if subject in self.robots else None
+        return "landmarks", f"landmark:{subject}"
+
     @staticmethod
-    def _measured(name: str, sensor: SensorPart, range_m: float, bearing_rad: float) -> tuple[Array, Array]:
-        kind = sensor_kind(name, sensor)
+    def _measured(kind: str, sensor: SensorPart, range_m: float, bearing_rad: float) -> tuple[Array, Array]:
         full = {"range": [range_m], "bearing": [bearing_rad], "range_bearing": [range_m, bearing_rad]}
-        return np.array(full[kind]), relative_noise(kind, sensor, range_m)
+        z = np.array(full[kind])
+        if not np.all(np.isfinite(z)):
+            raise ConfigError(f"the recording does not hold what a sensor of kind '{kind}' measures; take another kind")
+        return z, relative_noise(kind, sensor, range_m)
+
+    def _fixes(self, robot: RobotPart, k: int) -> list[Output]:
+        outputs = []
+        for name, sensor in robot.sensors.items():
+            kind = sensor_kind(name, sensor)
+            every = 1 if sensor.rate_hz is None else max(1, round(NS / (sensor.rate_hz * self.step_ns)))
+            if kind in RELATIVE_ANGLES or k % every:
+                continue
+            components, angles = ABSOLUTE[kind]
+            R = absolute_noise(kind, sensor)
+            z = self.truth(robot.id, k)[list(components)] + np.sqrt(np.diagonal(R)) * self._drawn(
+                robot.id, name, len(R), k
+            )
+            t_ns = k * self.step_ns
+            outputs.append(Output(t_ns, Phase.PRIVATE, robot.id, name, kind, None, wrap_components(z, angles), R))
+        return outputs

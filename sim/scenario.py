@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from agent.calibration import Form
 from agent.config_file import (
     ConfigError,
     Finite,
@@ -24,6 +25,7 @@ from agent.config_file import (
     validate,
 )
 from agent.config_parts import (
+    CalibrationPart,
     CoastPart,
     ControlNoisePart,
     ControlPart,
@@ -33,9 +35,14 @@ from agent.config_parts import (
     LocalizationPart,
     NetworkPart,
     OdometryPart,
+    RobotModel,
     SigmaPart,
     TrackingPart,
 )
+from agent.estimation.motion import LAYOUTS
+from agent.estimation.observation import RELATIVE_ANGLES
+from agent.sensor_input import SensorConfig
+from agent.settings import nanoseconds
 
 Subject = Literal["peers", "landmarks", "targets"]
 
@@ -58,7 +65,7 @@ class PlacementPart(Part):
 
 class WorldPart(Part):
     kind: Literal["simulated", "recording"] = "simulated"
-    format: Literal["utias"] | None = None
+    format: Literal["utias", "tiers"] = "utias"
     path: str | None = None
     placement: PlacementPart | None = None
 
@@ -81,7 +88,7 @@ class SensorPart(Part):
     sigma_m grows by sigma_m_per_m with the distance. `rate_hz` absent: once per step.
     """
 
-    kind: Literal["range", "bearing", "range_bearing", "position", "pose", "heading"] | None = None
+    kind: Literal["range", "bearing", "range_bearing", "vector", "position", "pose", "heading"] | None = None
     of: list[Subject] = []
     sigma_m: Positive | None = None
     sigma_m_per_m: NotNegative = 0.0
@@ -90,6 +97,9 @@ class SensorPart(Part):
     rate_hz: Positive | None = None
     mount: Vector3 = [0.0, 0.0, 0.0]
     two_way: bool = True
+    calibration: CalibrationPart = CalibrationPart()
+    lag_s: Finite = 0.0
+    form: Form = "polar"
 
 
 class AutopilotPart(Part):
@@ -101,7 +111,8 @@ class AutopilotPart(Part):
 
 class RobotPart(Part):
     id: Id
-    model: Literal["unicycle"] = "unicycle"
+    model: RobotModel = "unicycle"
+    gain_walk_per_sqrt_s: NotNegative = 0.003
     start: StartPart = StartPart()
     start_sigma: SigmaPart
     control: ControlPart = ControlPart()
@@ -117,11 +128,18 @@ class RobotPart(Part):
 class TargetPart(Part):
     id: Id
     model: Literal["unicycle", "constant_velocity", "damped_velocity"] = "unicycle"
-    start: StartPart
+    recorded: bool = False
+    start: StartPart = StartPart()
     start_sigma: SigmaPart
     control: ControlPart = ControlPart()
     noise: ControlNoisePart = ControlNoisePart()
     damping_s: Positive = 2.0
+
+
+class CentralizedPart(Part):
+    """The centralized filter of `--bound`: a pair's measurements are used at most so often (0: all of them)."""
+
+    pair_interval_s: NotNegative = 0.0
 
 
 class BoundPart(Part):
@@ -151,6 +169,7 @@ class Scenario(Part):
     robots: Annotated[list[RobotPart], Field(min_length=1)]
     targets: list[TargetPart] = []
     landmarks: list[LandmarkPart] = []
+    centralized: CentralizedPart = CentralizedPart()
     expect: dict[str, BoundPart] = {}
 
     def movers(self) -> dict[str, RobotPart | TargetPart]:
@@ -270,8 +289,6 @@ def check(scenario: Scenario) -> None:
     recorded = scenario.world.kind == "recording"
     if recorded and scenario.world.path is None:
         raise ConfigError(f"{scenario.name}: world.path is missing; add --set world.path=FOLDER of the recording")
-    if recorded and scenario.targets:
-        raise ConfigError(f"{scenario.name}: a recording has no targets; remove [[targets]]")
     placement = scenario.world.placement
     circling = [robot.id for robot in scenario.robots if robot.start.circle is not None]
     if placement is not None and circling and placement.reaches not in circling:
@@ -289,11 +306,19 @@ def check(scenario: Scenario) -> None:
         for name, sensor in robot.sensors.items():
             where = f"{scenario.name}: robots.{robot.id}.sensors.{name}"
             check_sensor(where, name, sensor)
-            if recorded and not sensor.of:
-                raise ConfigError(f"{where}: a recording holds sightings only; remove it")
     for target in scenario.targets:
         _check_sigma(f"{scenario.name}: targets.{target.id}", target)
-        if target.start.pose is None:
+        if target.recorded != recorded:
+            raise ConfigError(
+                f"{scenario.name}: targets.{target.id}.recorded = {str(recorded).lower()} is needed in a "
+                f"{scenario.world.kind} world"
+            )
+        if recorded and LAYOUTS[target.model].heading is not None:
+            raise ConfigError(
+                f"{scenario.name}: targets.{target.id}.model = '{target.model}' needs a control, and nobody knows that "
+                "of a recorded target; take 'damped_velocity' or 'constant_velocity'"
+            )
+        if not recorded and target.start.pose is None:
             raise ConfigError(f"{scenario.name}: targets.{target.id}.start.pose is missing")
 
 
@@ -304,7 +329,7 @@ def _check_sigma(where: str, part: RobotPart | TargetPart) -> None:
         raise ConfigError(f"{where}.{error}") from None
 
 
-KINDS = ("range", "bearing", "range_bearing", "position", "pose", "heading")
+KINDS = ("range", "bearing", "range_bearing", "vector", "position", "pose", "heading")
 
 
 def sensor_kind(name: str, sensor: SensorPart) -> str:
@@ -312,16 +337,22 @@ def sensor_kind(name: str, sensor: SensorPart) -> str:
     return sensor.kind if sensor.kind is not None else name
 
 
+def sensor_config(sensor: SensorPart) -> SensorConfig:
+    """The sensor as an estimator knows it."""
+    x, y, yaw = sensor.mount
+    return SensorConfig((x, y, yaw), sensor.calibration.settings(), nanoseconds(sensor.lag_s), sensor.form)
+
+
 def check_sensor(where: str, name: str, sensor: SensorPart) -> None:
     """Raises `ConfigError` if the sensor lacks a kind, a subject or a standard deviation."""
     kind = sensor_kind(name, sensor)
     if kind not in KINDS:
         raise ConfigError(f"{where}: state its kind, one of {', '.join(KINDS)}")
-    needs_m = kind in ("range", "range_bearing", "position", "pose")
+    needs_m = kind in ("range", "range_bearing", "vector", "position", "pose")
     needs_rad = kind in ("bearing", "range_bearing", "pose", "heading")
     if needs_m and sensor.sigma_m is None:
         raise ConfigError(f"{where}: sigma_m is missing")
     if needs_rad and sensor.sigma_rad is None:
         raise ConfigError(f"{where}: sigma_rad is missing")
-    if kind in ("range", "bearing", "range_bearing") and not sensor.of:
+    if kind in RELATIVE_ANGLES and not sensor.of:
         raise ConfigError(f'{where}: of is missing, for instance of = ["peers"]')

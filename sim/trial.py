@@ -8,7 +8,7 @@ from agent.config_file import ConfigError
 from agent.node import Recorder
 from sim.engine import FateSink, TrialResult, VirtualEngine
 from sim.recorded_world import RecordedWorld
-from sim.recordings.utias import RecordingError
+from sim.recordings.recording import RecordingError
 from sim.scenario import Scenario
 from sim.world import SimulatedWorld, World
 

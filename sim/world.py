@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.config_file import ConfigError
-from agent.estimation.gaussian import wrap
-from agent.estimation.motion import LAYOUTS, compose, velocity_step
+from agent.estimation.gain_motion import reported
+from agent.estimation.gaussian import wrap, wrap_components
+from agent.estimation.motion import LAYOUTS, UNICYCLE_GAINS, compose, velocity_step
 from agent.estimation.observation import RELATIVE_ANGLES, RelativeModel
 from agent.estimation.odometry import OdometryNoise
 from agent.settings import NS, nanoseconds
@@ -86,7 +87,12 @@ def relative_noise(kind: str, sensor: SensorPart, distance_m: float) -> Array:
     """R (m, m) of a relative measurement at a distance."""
     sigma_m = (sensor.sigma_m or 0.0) + sensor.sigma_m_per_m * distance_m
     sigma_rad = sensor.sigma_rad or 0.0
-    diagonal = {"range": [sigma_m], "bearing": [sigma_rad], "range_bearing": [sigma_m, sigma_rad]}[kind]
+    diagonal = {
+        "range": [sigma_m],
+        "bearing": [sigma_rad],
+        "range_bearing": [sigma_m, sigma_rad],
+        "vector": [sigma_m, sigma_m],
+    }[kind]
     return np.diag(np.square(diagonal))
 
 
@@ -122,14 +128,13 @@ class SimulatedWorld:
     def _drive(self, mover: RobotPart | TargetPart, start: Array) -> Array:
         """True states (steps + 1, n)."""
         layout = LAYOUTS[mover.model]
-        if len(start) != layout.dim:
-            raise ConfigError(
-                f"{self._scenario.name}: {mover.id}.start.pose needs {layout.dim} numbers for '{mover.model}'"
-            )
+        size = layout.dim if layout.heading is None else 3
+        if len(start) != size:
+            raise ConfigError(f"{self._scenario.name}: {mover.id}.start.pose needs {size} numbers for '{mover.model}'")
         dt = self._scenario.step_s
         noise = normal_rows(self._seed, self.steps, 2, mover.id, "control")
-        track = np.empty((self.steps + 1, layout.dim))
-        track[0] = start
+        track = np.zeros((self.steps + 1, layout.dim))
+        track[0] = [*start, *[1.0] * (layout.dim - size)]
         if layout.heading is None:
             assert isinstance(mover, TargetPart)
             F, Q = velocity_step(layout, dt, mover.damping_s)
@@ -144,8 +149,13 @@ class SimulatedWorld:
         sigma = np.array([mover.noise.speed_mps, mover.noise.yaw_rate_radps])
         moves = dt * (control + sigma * noise)
         for k in range(self.steps):
-            track[k + 1] = compose(track[k], np.array([moves[k, 0], 0.0, moves[k, 1]]))
+            track[k + 1, :3] = compose(track[k, :3], np.array([moves[k, 0], 0.0, moves[k, 1]]))
         track[:, 2] = wrap(track[:, 2])
+        if layout is UNICYCLE_GAINS:
+            assert isinstance(mover, RobotPart)
+            walk = mover.gain_walk_per_sqrt_s * np.sqrt(dt)
+            steps = normal_rows(self._seed, self.steps, 2, mover.id, "gains")
+            track[1:, 3:] += walk * np.cumsum(steps, axis=0) + 1.0
         return track
 
     def truth(self, entity: str, k: int) -> Array:
@@ -153,7 +163,8 @@ class SimulatedWorld:
 
     def start_belief(self, entity: str) -> tuple[Array, Array]:
         part = self._scenario.movers()[entity]
-        return drawn_belief(self._tracks[entity][0], part.start_sigma.covariance(part.model), self._seed, entity)
+        cov = part.start_sigma.covariance(part.model)
+        return drawn_belief(self._tracks[entity][0], cov, self._seed, entity, LAYOUTS[part.model].angles)
 
     def outputs(self, k: int) -> list[Output]:
         found: list[Output] = []
@@ -174,6 +185,8 @@ class SimulatedWorld:
         dt = self._scenario.step_s
         delta = np.array([robot.control.speed_mps * dt, 0.0, 0.0, robot.control.yaw_rate_radps * dt])
         noise = control_odometry(robot, dt)
+        if LAYOUTS[robot.model] is UNICYCLE_GAINS:
+            delta[[0, 1, 3]] = reported(self._tracks[robot.id][k - 1], delta[[0, 1, 3]])
         delta = noise.calibrated(delta)
         t_ns = k * self.step_ns
         cov = noise.covariance(delta, dt)
@@ -205,7 +218,7 @@ class SimulatedWorld:
             z = model.h(joint) + np.sqrt(np.diagonal(R)) * self._noise(robot.id, name, of, k, len(R))
             for index in model.angles:
                 z[index] = wrap(z[index])
-            if kind != "bearing":
+            if kind in ("range", "range_bearing"):
                 z[0] = max(z[0], 0.0)
             outputs.append(Output(t_ns, phase_of(of), robot.id, name, kind, of, z, R))
         return outputs
@@ -232,13 +245,15 @@ def _ranges_peers(robot: RobotPart) -> bool:
     )
 
 
-def drawn_belief(truth: Array, cov: Array, seed: int, entity: str) -> tuple[Array, Array]:
-    """Initial belief: truth plus a draw from its covariance; a heading is wrapped."""
-    draw = generator(seed, entity, "start").standard_normal(len(truth))
-    mean = truth + np.sqrt(np.diagonal(cov)) * draw
-    if len(mean) == 3:
-        mean[2] = wrap(mean[2])
-    return mean, cov
+def drawn_belief(truth: Array, cov: Array, seed: int, entity: str, angles: tuple[int, ...]) -> tuple[Array, Array]:
+    """Initial belief: truth plus a draw from its covariance; `angles` are wrapped.
+
+    A truth that is shorter than the state leaves gains of an odometry open: they are 1, as far as is known.
+    """
+    known, n = len(truth), len(cov)
+    draw = generator(seed, entity, "start").standard_normal(known)
+    mean = np.append(truth + np.sqrt(np.diagonal(cov)[:known]) * draw, np.ones(n - known))
+    return wrap_components(mean, angles), cov
 
 
 def start_pose(robot: RobotPart, phases: dict[str, float]) -> Array:

@@ -40,6 +40,21 @@ def scaled(states: Array, increment: Array) -> Array:
     )
 
 
+def reported(states: Array, increment: Array) -> Array:
+    """The increment (..., 3) that states (..., 5) see as `increment` (3,): the inverse of `scaled`."""
+    along, turn = states[..., ALONG], states[..., TURN]
+    half = -0.5 * (turn - 1.0) * increment[2] / turn
+    cos, sin = np.cos(half), np.sin(half)
+    return np.stack(
+        [
+            (cos * increment[0] - sin * increment[1]) / along,
+            (sin * increment[0] + cos * increment[1]) / along,
+            increment[2] / turn,
+        ],
+        axis=-1,
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class GainMotion(RobotMotion):
     """Motion by an odometry whose gains are states; each walks at random by `walk` / sqrt(s).

@@ -15,7 +15,8 @@ Array = NDArray[np.float64]
 class OdometryNoise:
     """Random-walk rates of an odometry: each variance is (rate_s^2 x seconds + rate_m^2 x metres + ...).
 
-    `scale_along` and `scale_turn` are calibrated gains: true motion = scale x reported motion.
+    `scale_along` and `scale_turn` are calibrated gains: true motion = scale x reported motion. `lag_s` is how much
+    later than its stamps the motion happens, where a command is reported.
     """
 
     along_m_per_sqrt_s: float = 0.02
@@ -26,6 +27,7 @@ class OdometryNoise:
     heading_rad_per_sqrt_rad: float = 0.0
     scale_along: float = 1.0
     scale_turn: float = 1.0
+    lag_s: float = 0.0
 
     def calibrated(self, delta: Array) -> Array:
         """The increment (dx, dy, dz, dyaw) with the calibrated gains applied."""

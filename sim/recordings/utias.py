@@ -9,121 +9,31 @@ are the robots `r1`-`r5`, 6-20 the landmarks `L6`-`L20`. Stamps are Unix time; t
 from __future__ import annotations
 
 import lzma
-import math
 import re
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import wrap
-from agent.estimation.motion import between
-
-Array = NDArray[np.float64]
-Stamps = NDArray[np.int64]
+from sim.recordings.recording import (
+    Array,
+    Odometry,
+    Recording,
+    RecordingError,
+    RobotRecording,
+    Sightings,
+    Stamps,
+    Truth,
+    common_span,
+)
 
 ROBOT_SUBJECTS = range(1, 6)
 START_MARGIN_NS = 5_000_000_000
 REMEDY = "give the path of an unpacked MR.CLAM data set"
 CUT = "the file is cut or altered; fetch it again"
 SECONDS = re.compile(r"([0-9]{1,10})(?:\.([0-9]*))?")
-
-
-class RecordingError(ValueError):
-    """A recording that cannot be used; one line names the file and the remedy."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Odometry:
-    """Commanded velocities, held until the next stamp: t_ns (K,), v_mps (K,), w_radps (K,).
-
-    `pose` (K, 3) is their exact integral from the first stamp.
-    """
-
-    t_ns: Stamps
-    v_mps: Array
-    w_radps: Array
-    pose: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
-    """Camera sightings: t_ns (K,), subject ids, range_m (K,) as recorded, bearing_rad (K,) left positive."""
-
-    t_ns: Stamps
-    subject: tuple[str, ...]
-    range_m: Array
-    bearing_rad: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Truth:
-    """Motion capture: t_ns (K,), pose (K, 3) with heading unwrapped."""
-
-    t_ns: Stamps
-    pose: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RobotRecording:
-    """One robot's files; truth is None where the folder has none."""
-
-    odometry: Odometry
-    sightings: Sightings
-    truth: Truth | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Recording:
-    """A whole folder. [start_ns, end_ns] is the span all robots have in common.
-
-    start_ns: 5 s after the last robot's first truth; end_ns: the first robot's last truth. A robot without truth
-    counts with its odometry. `left_out` names robots whose odometry or measurement file is missing; `counters`
-    says what was dropped and why.
-    """
-
-    robots: dict[str, RobotRecording]
-    landmarks: dict[str, tuple[float, float]]
-    start_ns: int
-    end_ns: int
-    counters: Counter[str] = field(default_factory=Counter)
-    left_out: tuple[str, ...] = ()
-
-    def _robot(self, name: str) -> RobotRecording:
-        if name not in self.robots:
-            raise RecordingError(f"the recording has no robot {name!r}; it has {', '.join(self.robots)}")
-        return self.robots[name]
-
-    def truth_at(self, robot: str, t_ns: int) -> Array:
-        """True pose (3,) interpolated linearly, heading wrapped.
-
-        Raises `RecordingError` without truth, and outside its span: a pose there would be invented.
-        """
-        truth = self._robot(robot).truth
-        if truth is None:
-            raise RecordingError(f"the recording has no ground truth of {robot}")
-        first, last = int(truth.t_ns[0]), int(truth.t_ns[-1])
-        if not first <= t_ns <= last:
-            raise RecordingError(f"{robot}: no ground truth at {t_ns} ns; it spans [{first}, {last}]")
-        index = max(int(np.searchsorted(truth.t_ns, t_ns)), 1)
-        if len(truth.t_ns) == 1:
-            pose = truth.pose[0].copy()
-        else:
-            before, after = int(truth.t_ns[index - 1]), int(truth.t_ns[index])
-            share = (t_ns - before) / (after - before)
-            pose = truth.pose[index - 1] + share * (truth.pose[index] - truth.pose[index - 1])
-        pose[2] = wrap(pose[2])
-        return np.asarray(pose)
-
-    def increment(self, robot: str, t0_ns: int, t1_ns: int) -> Array:
-        """Odometry (dx, dy, dyaw) over [t0, t1] in the body frame at t0: held commands, integrated as arcs.
-
-        Before its first command a robot stands; its last one is held on.
-        """
-        odometry = self._robot(robot).odometry
-        return between(_integrated(odometry, t0_ns), _integrated(odometry, t1_ns))
 
 
 def load(path: str | Path) -> Recording:
@@ -152,15 +62,10 @@ def load(path: str | Path) -> Recording:
     if not robots:
         raise RecordingError(f"{folder}: no robot has both an odometry and a measurement file; {REMEDY}")
     counters["robot_files_missing"] = len(left_out)
-    start_ns, end_ns = _span(robots)
+    start_ns, end_ns = common_span(robots, START_MARGIN_NS)
     if end_ns <= start_ns:
         raise RecordingError(f"{folder}: the robots' files have no common span of time; take them from one run")
     return Recording(robots, landmarks, start_ns, end_ns, counters, tuple(left_out))
-
-
-def _span(robots: dict[str, RobotRecording]) -> tuple[int, int]:
-    stamps = [(r.truth.t_ns if r.truth is not None else r.odometry.t_ns) for r in robots.values()]
-    return max(int(t[0]) for t in stamps) + START_MARGIN_NS, min(int(t[-1]) for t in stamps)
 
 
 def _find(folder: Path, name: str) -> Path | None:
@@ -275,18 +180,6 @@ def _odometry(folder: Path, number: int, counters: Counter[str]) -> Odometry:
     middle, chord = pose[:-1, 2] + turn / 2.0, values[:-1, 0] * dt * np.sinc(turn / 2.0 / np.pi)
     pose[1:, 0], pose[1:, 1] = np.cumsum(chord * np.cos(middle)), np.cumsum(chord * np.sin(middle))
     return Odometry(stamps, values[:, 0], values[:, 1], pose)
-
-
-def _integrated(odometry: Odometry, t_ns: int) -> Array:
-    """Integral (3,) of the commands from the first stamp to t."""
-    index = int(np.searchsorted(odometry.t_ns, t_ns, side="right")) - 1
-    if index < 0:
-        return np.asarray(odometry.pose[0])
-    dt = (t_ns - int(odometry.t_ns[index])) * 1e-9
-    x, y, heading = (float(value) for value in odometry.pose[index])
-    half = float(odometry.w_radps[index]) * dt / 2.0
-    chord = float(odometry.v_mps[index]) * dt * (math.sin(half) / half if half else 1.0)
-    return np.array([x + chord * math.cos(heading + half), y + chord * math.sin(heading + half), heading + 2.0 * half])
 
 
 def _sightings(

@@ -23,7 +23,7 @@ import tomli_w
 from pydantic import BaseModel
 
 from agent.config import AgentConfig, load_agent_config
-from agent.config_parts import ControlNoisePart, ControlPart, LinksPart, OdometryPart, SigmaPart
+from agent.config_parts import CalibrationPart, ControlNoisePart, ControlPart, LinksPart, OdometryPart, SigmaPart
 from agent.events import Observation
 from agent.sensor_input import ABSOLUTE_KINDS, SIZES, decode
 from deploy.cli import main, parser
@@ -122,6 +122,7 @@ PARTS: dict[type[BaseModel], str] = {
     ControlNoisePart: "noise",
     OdometryPart: "odometry",
     LinksPart: "links",
+    CalibrationPart: "calibration",
 }
 """Tables that occur in several places and are described once."""
 

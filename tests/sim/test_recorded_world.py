@@ -149,7 +149,7 @@ def test_a_recording_is_played_like_any_world_and_repeats(folder: Path) -> None:
 
 
 def test_a_robot_the_recording_lacks_is_named(folder: Path) -> None:
-    with pytest.raises(ConfigError, match="no odometry of robot r5"):
+    with pytest.raises(ConfigError, match="no data of robot r5; there are: r1, r2, r3"):
         open_world(scenario(folder, ("r1", "r5")), 1)
     with pytest.raises(ConfigError, match="no ground truth of robot r3"):
         open_world(scenario(folder, ("r1", "r3")), 1)

@@ -166,9 +166,10 @@ def test_a_recording_needs_its_path_and_has_no_more_than_it_holds() -> None:
     assert "world.path" in complaint(name="utias-all")
     path = "world.path=/somewhere"
     target = 'targets=[{id="t1",start={pose=[0,0,0]},start_sigma={position_m=1.0,heading_rad=1.0}}]'
-    assert "remove [[targets]]" in complaint(path, target, name="utias-all")
-    gps = "robots.r1.sensors.position={sigma_m=1.0}"
-    assert "robots.r1.sensors.position: a recording holds sightings only" in complaint(path, gps, name="utias-all")
+    assert "targets.t1.recorded = true is needed" in complaint(path, target, name="utias-all")
+    recorded = target.replace('"t1",', '"t1",recorded=true,')
+    assert "nobody knows that" in complaint(path, recorded, name="utias-all")
+    assert "recorded = false is needed in a simulated world" in complaint(recorded)
 
 
 def test_a_file_that_is_not_there_not_a_file_or_not_toml(tmp_path: Path) -> None:

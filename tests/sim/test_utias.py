@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.recordings.utias import Recording, RecordingError, load
+from sim.recordings.recording import Recording, RecordingError
+from sim.recordings.utias import load
 
 T0 = 1_248_446_180
 NS = 1_000_000_000
@@ -79,7 +80,9 @@ def test_compressed_and_plain_files_read_alike(folder: Folder, tmp_path: Path) -
     other.compressed = set(other.files)
     packed = other.load()
     for name in plain.robots:
-        assert np.array_equal(plain.robots[name].odometry.pose, packed.robots[name].odometry.pose)
+        one, other_one = plain.robots[name].odometry, packed.robots[name].odometry
+        assert one is not None and other_one is not None
+        assert np.array_equal(one.pose, other_one.pose)
         assert np.array_equal(plain.robots[name].sightings.t_ns, packed.robots[name].sightings.t_ns)
     assert (plain.start_ns, plain.end_ns) == (packed.start_ns, packed.end_ns)
 
