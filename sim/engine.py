@@ -130,8 +130,10 @@ class Sampler:
         }
 
         def state(entity: str, belief: tuple[Array, Array]) -> StateTrace:
-            layout = self._layouts[entity]
-            return StateTrace(truths[entity], belief[0], belief[1], layout.angles, layout.position)
+            layout, known = self._layouts[entity], truths[entity].shape[1]
+            # What nobody knows the truth of (gains of a recorded odometry) has no figures.
+            mean, cov = belief[0][:, :known], belief[1][:, :known, :known]
+            return StateTrace(truths[entity], mean, cov, layout.angles, layout.position)
 
         bound = None
         if self._bound is not None:

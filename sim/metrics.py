@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 Window = tuple[float, float]
 
 MAX_SERIES = 400
+RECENT_S = 2.0
+"""A track has figures of its own within this time after a sighting."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,6 +121,7 @@ def _reduced(trace: StateTrace, inside: NDArray[np.bool_], stride: int) -> dict[
     present = np.flatnonzero(seen)
     return {
         "names": names,
+        "known": bool(np.isfinite(trace.truth).any()),
         "count": int(use.sum()),
         "position": float(squared[use].sum()),
         "heading": float(np.sum(within[:, list(trace.angles)] ** 2)) if trace.angles else None,
@@ -135,8 +138,27 @@ def _reduced(trace: StateTrace, inside: NDArray[np.bool_], stride: int) -> dict[
     }
 
 
-def reduce_trial(trace: TrialTrace, window_s: Window) -> dict[str, Any]:
-    """What is kept of a trial: sums over the window, and series of at most `MAX_SERIES` instants."""
+def _recent(trace: StateTrace, t_s: Array, inside: NDArray[np.bool_], sightings: Sequence[Array]) -> dict[str, Any]:
+    """Count, sum of squares and largest of the position errors in the window within `RECENT_S` after a sighting [s]."""
+    times = np.sort(np.concatenate([[-np.inf], *sightings]))
+    last = times[np.searchsorted(times, t_s + 1e-9, side="right") - 1]
+    error = position_errors(trace)[inside & (t_s - last <= RECENT_S + 1e-9)]
+    error = error[np.isfinite(error)]
+    return {
+        "count": len(error),
+        "position": float(np.sum(error**2)),
+        "max_position": float(error.max()) if len(error) else None,
+    }
+
+
+def reduce_trial(
+    trace: TrialTrace, window_s: Window, measured: dict[tuple[str, str], Array] | None = None
+) -> dict[str, Any]:
+    """What is kept of a trial: sums over the window, and series of at most `MAX_SERIES` instants.
+
+    `measured` has the instants [s] at which a robot measured somebody, by (robot, of): a track's figures shortly after
+    a sighting are of sightings by its own robot, those of the bound of anybody's.
+    """
     inside = (trace.t_s >= window_s[0] - 1e-9) & (trace.t_s <= window_s[1] + 1e-9)
     stride = max(1, -(-len(trace.t_s) // MAX_SERIES))
 
@@ -147,12 +169,21 @@ def reduce_trial(trace: TrialTrace, window_s: Window) -> dict[str, Any]:
                 del entry["nees_series"]
         return found
 
-    return {
+    reduced: dict[str, Any] = {
         "t_s": trace.t_s[::stride],
         "robots": states(trace.robots, ratios=True),
         "targets": {target: states(owners) for target, owners in trace.targets.items()},
         "bound": None if trace.bound is None else {group: states(items) for group, items in trace.bound.items()},
     }
+    for target, owners in trace.targets.items() if measured is not None else ():
+        seen = {robot: times for (robot, of), times in (measured or {}).items() if of == f"target:{target}"}
+        for robot, track in owners.items():
+            mine = [seen[robot]] if robot in seen else []
+            reduced["targets"][target][robot]["recent"] = _recent(track, trace.t_s, inside, mine)
+        if trace.bound is not None:
+            best = trace.bound["targets"][target]
+            reduced["bound"]["targets"][target]["recent"] = _recent(best, trace.t_s, inside, list(seen.values()))
+    return reduced
 
 
 def summarize(traces: Sequence[TrialTrace], window_s: Window, lost_above_m: float) -> dict[str, Any]:
@@ -187,10 +218,11 @@ def _anees(items: Sequence[dict[str, Any]]) -> float | None:
 def is_lost(reduced: dict[str, Any], lost_above_m: float) -> bool:
     """Whether a belief's position RMSE over the window is above the limit, or a robot has no estimate in it.
 
-    A target nobody has told a robot of is no belief, hence not a lost one.
+    A robot whose truth nobody knows is not lost, as far as can be told. A target nobody has told a robot of is no belief,
+    hence not a lost one.
     """
     robots = list(reduced["robots"].values())
-    return any(item["count"] == 0 for item in robots) or any(
+    return any(item["known"] and item["count"] == 0 for item in robots) or any(
         item["position"] > lost_above_m**2 * item["count"] for item in [*robots, *_tracks(reduced)]
     )
 
@@ -211,6 +243,7 @@ def _entity(items: Sequence[dict[str, Any]], robot: bool) -> dict[str, Any]:
     over all samples of all trials, `position_error_max_m` is the largest of all; `final_position_error_m` is the median
     over trials of the last error. Of each component's absolute error, `error_min` and `error_max` are medians over
     trials of the smallest and largest in a trial, `error_worst` is the largest of all. `dof` is the size of the state.
+    `position_rmse_2s_m` and `error_max_2s_m` of a track are of instants shortly after a sighting of its target.
     """
     names = items[0]["names"]
     figures: dict[str, Any] = {"dof": len(names), "position_rmse_m": _rmse(items)}
@@ -220,6 +253,10 @@ def _entity(items: Sequence[dict[str, Any]], robot: bool) -> dict[str, Any]:
     if robot:
         figures["position_error_max_m"] = _largest([item["max_position"] for item in items])
         figures["final_position_error_m"] = _median([item["final"] for item in items])
+    if "recent" in items[0]:
+        recent = [item["recent"] for item in items]
+        figures["position_rmse_2s_m"] = _rmse(recent)
+        figures["error_max_2s_m"] = _largest([item["max_position"] for item in recent])
     figures["anees"] = _anees(items)
     figures["containment_3sigma"] = _ratio(items, "inside")
     for key, of, over in (

@@ -17,7 +17,7 @@ NOT_COMPARED = "timing"
 def reduce(scenario: Scenario, result: TrialResult) -> dict[str, Any]:
     """The small part of a trial that a summary needs; what a worker process sends back."""
     return {
-        "figures": reduce_trial(result.trace, (scenario.window_s[0], scenario.window_s[1])),
+        "figures": reduce_trial(result.trace, (scenario.window_s[0], scenario.window_s[1]), result.measured),
         "network": result.network,
         "rejected": result.rejected,
         "nis": result.nis,

@@ -339,3 +339,30 @@ def test_a_trials_row_names_fleet_and_robots() -> None:
 def test_nothing_can_be_said_of_no_trials() -> None:
     with pytest.raises(ValueError, match="give at least one"):
         combine([], LOST_M)
+
+
+def test_a_track_has_figures_of_the_time_shortly_after_its_robots_sightings() -> None:
+    t_s = np.arange(20.0)
+    truth = np.zeros((20, 4))
+    mean = np.tile([1.0, 0.0, 0.0, 0.0], (20, 1))
+    mean[5:8, 0], mean[12:15, 0] = 0.1, 0.2
+    track = StateTrace(truth, mean, np.tile(np.eye(4), (20, 1, 1)), ())
+    own = StateTrace(np.zeros((20, 3)), np.zeros((20, 3)), np.tile(np.eye(3), (20, 1, 1)), (2,))
+    robots = {"r1": own, "r2": own, "r3": own}
+    trace = TrialTrace(t_s, robots, {"t1": dict.fromkeys(robots, track)}, {"robots": robots, "targets": {"t1": track}})
+    measured = {("r1", "target:t1"): np.array([5.0]), ("r2", "target:t1"): np.array([12.0]), ("r3", "r1"): t_s}
+    summary = combine([reduce_trial(trace, (0.0, 20.0), measured)], 8.0)
+    of = {name: entry["position_rmse_2s_m"] for name, entry in summary["targets"]["t1"].items()}
+    assert of == {"r1": pytest.approx(0.1), "r2": pytest.approx(0.2), "r3": None}
+    assert summary["targets"]["t1"]["r2"]["error_max_2s_m"] == pytest.approx(0.2)
+    assert summary["bound"]["targets"]["t1"]["position_rmse_2s_m"] == pytest.approx(np.sqrt((0.01 + 0.04) / 2.0))
+    late = combine([reduce_trial(trace, (14.5, 20.0), measured)], 8.0)
+    assert late["targets"]["t1"]["r2"]["position_rmse_2s_m"] is None
+
+
+def test_a_robot_without_truth_has_no_figures_and_is_not_lost() -> None:
+    unknown = StateTrace(np.full((5, 3), np.nan), np.zeros((5, 3)), np.tile(np.eye(3), (5, 1, 1)), (2,))
+    summary = summarize([TrialTrace(np.arange(5.0), {"r1": unknown}, {})], (0.0, 5.0), 8.0)
+    assert summary["lost"] == 0
+    assert summary["robots"]["r1"]["position_rmse_m"] is None
+    assert summary["fleet"]["anees"] is None
