@@ -218,8 +218,8 @@ def _anees(items: Sequence[dict[str, Any]]) -> float | None:
 def is_lost(reduced: dict[str, Any], lost_above_m: float) -> bool:
     """Whether a belief's position RMSE over the window is above the limit, or a robot has no estimate in it.
 
-    A robot whose truth nobody knows is not lost, as far as can be told. A target nobody has told a robot of is no belief,
-    hence not a lost one.
+    A robot whose truth nobody knows is not lost, as far as can be told. A target nobody has told a robot of is no
+    belief, hence not a lost one.
     """
     robots = list(reduced["robots"].values())
     return any(item["known"] and item["count"] == 0 for item in robots) or any(
