@@ -15,14 +15,12 @@ from agent.estimation.observation import ABSOLUTE, RELATIVE_ANGLES
 from agent.settings import NS, nanoseconds
 from agent.timeline import Phase
 from sim.noise import normal_rows
-from sim.recordings import tiers, utias
+from sim.recordings import LOADERS
 from sim.recordings.recording import Recording
 from sim.scenario import RobotPart, Scenario, SensorPart, sensor_kind
 from sim.world import Output, absolute_noise, control_odometry, drawn_belief, order, phase_of, relative_noise
 
 Array = NDArray[np.float64]
-
-LOADERS = {"utias": utias.load, "tiers": tiers.load}
 
 
 @lru_cache(maxsize=2)

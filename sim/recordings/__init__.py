@@ -1,1 +1,7 @@
-"""Loaders of recorded multi-robot data."""
+"""Loaders of recorded multi-robot data, by the `world.format` of a scenario."""
+
+from __future__ import annotations
+
+from sim.recordings import tiers, utias
+
+LOADERS = {"utias": utias.load, "tiers": tiers.load}
