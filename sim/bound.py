@@ -53,6 +53,8 @@ class BoundRunner:
         end = k * self._step_ns
         while self._waiting and self._waiting[0].t_ns <= end - self._lag_ns:
             self._settled.use(self._waiting.pop(0), self._sensors)
+        # Steps that are over are moved through once, not again with every copy.
+        self._settled.move_to((end - max(self._lag_ns, 0)) // self._step_ns * self._step_ns)
         self._shown = self._settled if self._lag_ns <= 0 else self._settled.copy()
         for item in self._waiting:
             if item.t_ns <= end:
