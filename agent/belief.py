@@ -78,10 +78,11 @@ NO_PAIR = PairRecord()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetState:
-    """Belief of a target at the robot state's instant: mean (n,), cov (n, n)."""
+    """Belief of a target at the robot state's instant: mean (n,), cov (n, n), and when something was last learnt."""
 
     mean: Array
     cov: Array
+    updated_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from agent.belief import CorrelationStack, RobotState, TargetState
 from agent.effects import Effect, Estimate, Send, TrackEstimate
 from agent.estimation.colocalization import Options, absolute_update, sighting_update
-from agent.estimation.motion import StateLayout
-from agent.estimation.observation import AbsoluteModel, RelativeModel
+from agent.estimation.observation import AbsoluteModel, RelativeModel, relative_model
 from agent.events import LinkChange, Observation, Received
 from agent.history import History, moved
 from agent.pairs import Pairs
@@ -37,7 +36,7 @@ class FactorFilter:
         stack = CorrelationStack(np.zeros((len(settings.mean), 0)))
         targets = {t.id: TargetState(t.mean, t.cov) for t in settings.targets if settings.track}
         self.state = RobotState(settings.start_ns, settings.mean, settings.cov, stack, {}, targets)
-        self._target_layouts: dict[str, StateLayout] = {t.id: t.motion.layout for t in settings.targets}
+        self._target_motions = {t.id: t.motion for t in settings.targets}
         self.history = History(settings, self.state)
         localization = settings.localization
         self._options = Options(localization.transform, localization.parameters, localization.innovation_cap)
@@ -58,7 +57,7 @@ class FactorFilter:
     def estimate(self) -> Estimate:
         state = self.state
         tracks = tuple(
-            TrackEstimate(name, self._target_layouts[name].name, target.mean, target.cov)
+            TrackEstimate(name, self._target_motions[name].layout.name, target.mean, target.cov)
             for name, target in state.targets.items()
         )
         return Estimate(state.t_ns, self._settings.layout.name, state.mean, state.cov, tracks)
@@ -103,19 +102,22 @@ class FactorFilter:
         self._count_nis(kind, update.nis)
 
     def sighting(self, t_ns: int, target: str, event: Observation) -> None:
-        belief = self.state.targets.get(target)
-        if belief is None:
+        if target not in self.state.targets:
             self._counters["observation.unknown_target"] += 1
             return
-        if self._late(t_ns):
+        then = self._when(t_ns, target)
+        if then is None:
             self._counters["late.target_dropped"] += 1
             return
+        late = then is not self.state
+        belief = then.targets[target]
         localization = self._settings.localization
-        layout = self._target_layouts[target]
+        motion = self._target_motions[target]
+        layout = motion.layout
         own, track, nis = sighting_update(
-            (self.state.mean, self.state.cov, self._settings.layout),
+            (then.mean, then.cov, self._settings.layout),
             (belief.mean, belief.cov, layout),
-            RelativeModel(event.kind, self._settings.layout, event.mount),
+            relative_model(event, self._settings.layout, layout),
             event.z,
             event.R,
             localization.sighting_weight,
@@ -126,13 +128,31 @@ class FactorFilter:
         self._counters["used.sighting_own"] += own is not None
         self._counters["used.sighting_target"] += track is not None
         state = self.state
-        if own is not None:
+        if late:
+            self._counters["late.target_compensated"] += 1
+            corrected = self.history.corrected(then.t_ns, own) if own is not None else None
+            state = corrected if corrected is not None else state
+        elif own is not None:
             state = state.updated(own.mean, own.cov, own.left)
         if track is not None:
-            state = replace(state, targets={**state.targets, target: TargetState(track.mean, track.cov)})
+            mean, cov = track.mean, track.cov
+            if state.t_ns > then.t_ns:
+                drifted = motion.drift(mean, cov, (state.t_ns - then.t_ns) * 1e-9, localization.transform)
+                mean, cov = drifted.mean, drifted.cov
+            state = replace(state, targets={**state.targets, target: TargetState(mean, cov, then.t_ns)})
         if state is not self.state:
             self.state = state
-            self.history.updated(state, None if own is None else own.left)
+            self.history.updated(state, None if own is None or late else own.left)
+
+    def _when(self, t_ns: int, target: str) -> RobotState | None:
+        """The state a sighting at `t_ns` is used in. A late one is used where nothing new was learnt since."""
+        if not self._late(t_ns):
+            return self.state
+        then = None if self._settings.lateness.kind == "discard" else self.history.cut(t_ns)
+        if then is None or target not in then.targets:
+            return None
+        last = self.state.targets[target].updated_ns
+        return then if last == then.targets[target].updated_ns and last <= t_ns else None
 
     # -- peers ----------------------------------------------------------------------------------------------
 

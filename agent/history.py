@@ -55,7 +55,7 @@ def moved(
         belief = state.targets.get(target.id)
         if belief is not None:
             drifted = target.motion.drift(belief.mean, belief.cov, dt_s, localization.transform)
-            targets[target.id] = TargetState(drifted.mean, drifted.cov)
+            targets[target.id] = TargetState(drifted.mean, drifted.cov, belief.updated_ns)
     return (
         replace(state, t_ns=t_ns, mean=own.mean, cov=own.cov, stack=state.stack.left(own.F), targets=targets),
         own.F,

@@ -18,7 +18,8 @@ from agent.estimation.colocalization import (
 )
 from agent.estimation.gaussian import symmetrize, wrap_components
 from agent.estimation.intersection import fuse
-from agent.estimation.observation import RELATIVE_ANGLES
+from agent.estimation.motion import STATES
+from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError
 from agent.events import LinkChange, Received
 from agent.history import History
 from agent.pairing import PairExchange, Step
@@ -248,13 +249,14 @@ class Pairs:
     # -- estimation -----------------------------------------------------------------------------------------
 
     def _fits(self, told: Snapshot) -> bool:
-        """Whether a peer's snapshot is of the model and the sizes that the pair's algebra needs."""
-        layout = self._settings.layout
+        """Whether a peer's snapshot is of a robot and of the sizes that the pair's algebra needs."""
+        layout = STATES.get(told.belief.model)
+        if layout is None or layout.heading is None:
+            return False
         square = (layout.dim, layout.dim)
         return (
-            told.belief.model == layout.name
-            and told.belief.cov.shape == square
-            and (not told.base.met or told.factor.shape == square)
+            told.belief.cov.shape == square
+            and (not told.base.met or told.factor.shape == (layout.dim, self._settings.layout.dim))
             and told.line.shape == square
             and all(line.matrix.shape == square for line in told.lines)
         )
@@ -283,6 +285,8 @@ class Pairs:
         extra = {
             "range": [moved],
             "bearing": [moved / reach**2],
+            "bearing3": [moved, moved],
+            "pixel": [moved, moved],
             "range_bearing": [moved, moved / reach**2],
             "vector": [moved, moved],
         }
@@ -310,10 +314,12 @@ class Pairs:
                 responder,
                 own_is_low == own_initiated,
                 measurements,
-                self._settings.layout,
                 correlated,
                 self._options,
             )
+        except OutOfViewError:
+            self._counters["pair.out_of_view"] += 1
+            return state
         except np.linalg.LinAlgError:
             self._counters["pair.indefinite"] += 1
             return state
@@ -363,7 +369,7 @@ class Pairs:
                 gain = own.cov @ np.linalg.inv(own.cov + cov)
                 mean = wrap_components(own.mean + gain @ wrap_components(mean - own.mean, angles), angles)
                 cov = symmetrize(own.cov - gain @ own.cov)
-            targets[told.target] = TargetState(mean, cov)
+            targets[told.target] = TargetState(mean, cov, state.t_ns)
         return replace(state, targets=targets) if targets else state
 
 
