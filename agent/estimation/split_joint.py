@@ -1,0 +1,112 @@
+"""Update of one robot from a peer's snapshot when their correlation is only partly known (split covariance
+intersection on the joint state of a robot and its targets).
+
+The error covariance of a belief is split as P = private + shared: `private` noise is held by nobody else, `shared`
+may be correlated with every other robot's shared error in any way. For any gain K the new shared error is
+(I - K H_l) r_l - K H_o r_o, and whatever the correlation of r_l and r_o its covariance is bounded by
+X / w + Y / (1 - w) for any w in (0, 1). Gain and bound are decoupled: every candidate gain is charged its own best bound, which for
+w = sx / (sx + sy) adds standard deviations. Costs are traces in the metric of the prior's inverse, since a metric
+that one unobservable direction dominates would refuse useful updates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.estimation.gaussian import gain, symmetrize
+
+Array = NDArray[np.float64]
+
+PAIRS_OF_FACTORS = ((1.0, 1.0), (1.0, 2.0), (1.0, 4.0), (1.0, 16.0))
+"""How often the own and the other's shared covariance enter a candidate gain's innovation."""
+
+WIDEST = 1e9
+"""Largest ratio of the two shared parts' deviations in a bound; any ratio bounds, an infinite one is no number."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Split:
+    """Error covariance P = private + shared, both (n, n) positive semi-definite."""
+
+    private: Array
+    shared: Array
+
+    @property
+    def cov(self) -> Array:
+        return self.private + self.shared
+
+    def mapped(self, A: Array, private_noise: Array | None = None, shared_noise: Array | None = None) -> Split:
+        """The split after the error was mapped by A (n, n) and independent noise was added to either part."""
+        private, shared = A @ self.private @ A.T, A @ self.shared @ A.T
+        if private_noise is not None:
+            private = private + private_noise
+        if shared_noise is not None:
+            shared = shared + shared_noise
+        return Split(symmetrize(private), symmetrize(shared))
+
+    def told(self) -> Split:
+        """The split once the belief has been sent: what was private may be held by a peer now."""
+        return Split(np.zeros_like(self.private), symmetrize(self.private + self.shared))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SplitUpdate:
+    """Gain K (n, m) of the innovation, the split after it, and the trace cost relative to n before it."""
+
+    K: Array
+    split: Split
+    cost: float
+
+
+def update_own(split: Split, H: Array, R: Array) -> SplitUpdate:
+    """Use a measurement of the own joint state with private noise: H (m, n), R (m, m) including residuals."""
+    P = split.cov
+    K = gain(P @ H.T, H @ P @ H.T + R)
+    left = np.eye(len(P)) - K @ H
+    after = split.mapped(left, K @ R @ K.T)
+    return SplitUpdate(K, after, float(np.trace(np.linalg.solve(P, after.cov))))
+
+
+def _factors(own: float, other: float) -> list[tuple[float, float]]:
+    """Candidates (f_own, f_other) for shared parts that contribute variances `own`, `other` to the innovation."""
+    s_own, s_other = np.sqrt(max(own, 0.0)), np.sqrt(max(other, 0.0))
+    q = s_own / (s_own + s_other) if s_own + s_other > 0.0 else 0.5
+    found = list(PAIRS_OF_FACTORS)
+    for w in (q, (1.0 + q) / 2.0, 0.8, 0.5, 0.2):
+        w = min(max(float(w), 1e-3), 1.0 - 1e-3)
+        found.append((1.0 / w, 1.0 / (1.0 - w)))
+    return found
+
+
+def update_from_peer(own: Split, other: Split, H_own: Array, H_other: Array, R: Array) -> SplitUpdate | None:
+    """Use an innovation nu = H_own e_own + H_other e_other + v of two beliefs, for the own one only.
+
+    own (n, n), other (k, k), H_own (m, n), H_other (m, k), R (m, m) positive definite. The own private noise up to now
+    and the measurement noise are shared afterwards, since the peer may use the same innovation. None if no gain
+    lowers the trace of P relative to the prior: the belief is better left alone.
+    """
+    n = len(own.private)
+    shared_own, shared_other = H_own @ own.shared @ H_own.T, H_other @ other.shared @ H_other.T
+    known = symmetrize(H_own @ own.private @ H_own.T + H_other @ other.private @ H_other.T + R)
+    C_private, C_shared = own.private @ H_own.T, own.shared @ H_own.T
+    metric = np.linalg.inv(own.cov)
+    best: SplitUpdate | None = None
+    lowest = float(n)
+    for f_own, f_other in _factors(float(np.trace(shared_own)), float(np.trace(shared_other))):
+        K = gain(C_private + f_own * C_shared, known + f_own * shared_own + f_other * shared_other)
+        left = np.eye(n) - K @ H_own
+        X, Y = left @ own.shared @ left.T, K @ shared_other @ K.T
+        sx = np.sqrt(max(float(np.sum(metric * X)), 0.0))
+        sy = np.sqrt(max(float(np.sum(metric * Y)), 0.0))
+        ratio = min(max(sy / sx, 1.0 / WIDEST), WIDEST) if sx > 0.0 else WIDEST
+        bound = X * (1.0 + ratio) + Y * (1.0 + 1.0 / ratio)
+        certain = left @ own.private @ left.T + K @ (H_other @ other.private @ H_other.T + R) @ K.T
+        after = symmetrize(bound + certain)
+        cost = float(np.sum(metric * after))
+        if cost < lowest:
+            lowest = cost
+            best = SplitUpdate(K, Split(np.zeros((n, n)), after), cost)
+    return best
