@@ -4,9 +4,9 @@ intersection on the joint state of a robot and its targets).
 The error covariance of a belief is split as P = private + shared: `private` noise is held by nobody else, `shared`
 may be correlated with every other robot's shared error in any way. For any gain K the new shared error is
 (I - K H_l) r_l - K H_o r_o, and whatever the correlation of r_l and r_o its covariance is bounded by
-X / w + Y / (1 - w) for any w in (0, 1). Gain and bound are decoupled: every candidate gain is charged its own best bound, which for
-w = sx / (sx + sy) adds standard deviations. Costs are traces in the metric of the prior's inverse, since a metric
-that one unobservable direction dominates would refuse useful updates.
+X / w + Y / (1 - w) for any w in (0, 1). Gain and bound are decoupled: every candidate gain is charged its own best
+bound, which for w = sx / (sx + sy) adds standard deviations. Costs are traces in the metric of the prior's inverse,
+since a metric that one unobservable direction dominates would refuse useful updates.
 """
 
 from __future__ import annotations
