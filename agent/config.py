@@ -25,16 +25,20 @@ from agent.config_parts import (
     AgentTargetPart,
     CalibrationPart,
     CoastPart,
+    IntrinsicsPart,
     LandmarkPart,
     LatenessPart,
     LinksPart,
     LocalizationPart,
     MotionPart,
+    MountVector,
     NetworkPart,
     OdometryPart,
+    SensorKind,
     SigmaPart,
     TrackingPart,
 )
+from agent.estimation.observation import mount_of
 from agent.mavlink import MavlinkEndpointError, parse_endpoint
 from agent.sensor_input import SensorConfig
 from agent.settings import AgentSettings, nanoseconds
@@ -67,17 +71,18 @@ class InitialPart(Part):
 class AgentSensorPart(Part):
     """A sensor as the estimator knows it; the covariance comes with every measurement."""
 
-    kind: Literal["range", "bearing", "range_bearing", "vector", "position", "pose", "heading", "odometry"]
-    mount: Vector3 = [0.0, 0.0, 0.0]
+    kind: SensorKind | Literal["odometry"]
+    mount: MountVector = [0.0, 0.0, 0.0]
     two_way: bool = True
     calibration: CalibrationPart = CalibrationPart()
     lag_s: Finite = 0.0
     form: Form = "polar"
+    intrinsics: IntrinsicsPart | None = None
 
     def settings(self) -> SensorConfig:
         calibration = NO_CALIBRATION if self.calibration == CalibrationPart() else self.calibration.settings()
-        x, y, yaw = self.mount
-        return SensorConfig((x, y, yaw), calibration, nanoseconds(self.lag_s), self.form)
+        intrinsics = None if self.intrinsics is None else self.intrinsics.settings()
+        return SensorConfig(mount_of(self.mount), calibration, nanoseconds(self.lag_s), self.form, intrinsics)
 
 
 class PeerPart(Part):
@@ -175,7 +180,7 @@ class AgentConfig(Part):
             cov=self.initial.start_sigma.covariance(self.motion.model),
             motion=self.motion.settings(),
             targets=tuple(target.settings() for target in self.targets),
-            landmarks={item.id: (item.position[0], item.position[1]) for item in self.landmarks},
+            landmarks={item.id: item.place() for item in self.landmarks},
             one_way_sensors=tuple(name for name, part in sorted(self.sensors.items()) if not part.two_way),
             localization=self.localization.settings(),
             lateness=self.lateness.settings(),
@@ -195,6 +200,13 @@ def load_agent_config(path: Path) -> AgentConfig:
             target.settings()
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
+    try:
+        config.motion.settings()
+    except ConfigError as error:
+        raise ConfigError(f"{path}: motion.altitude_sigma_m: {error}") from None
+    sensor = next((n for n, part in config.sensors.items() if part.kind == "pixel" and part.intrinsics is None), None)
+    if sensor is not None:
+        raise ConfigError(f"{path}: sensors.{sensor}.intrinsics is missing: pixels mean nothing without focal_px")
     try:
         config.motion.completed(config.initial.mean)
         config.initial.start_sigma.covariance(config.motion.model)

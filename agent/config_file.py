@@ -22,6 +22,8 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Vector2 = Annotated[list[Finite], Field(min_length=2, max_length=2)]
 Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
+Point = Annotated[list[Finite], Field(min_length=2, max_length=3)]
+"""x, y or x, y, z [m]."""
 
 
 class ConfigError(ValueError):

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import AfterValidator
+from pydantic_core import PydanticCustomError
 
 from agent.calibration import Calibration
-from agent.config_file import ConfigError, Finite, Id, LandmarkId, NotNegative, Part, Positive, Share, Vector2
+from agent.config_file import ConfigError, Finite, Id, LandmarkId, NotNegative, Part, Point, Positive, Share, Vector2
 from agent.estimation.gain_motion import GainMotion
-from agent.estimation.motion import LAYOUTS, RobotMotion, TargetMotion
+from agent.estimation.motion import (
+    LAYOUTS,
+    SPATIAL,
+    HeldAltitude,
+    RobotMotion,
+    SpatialMotion,
+    StateLayout,
+    TargetMotion,
+)
+from agent.estimation.observation import Intrinsics
 from agent.estimation.odometry import OdometryNoise
 from agent.settings import CoastSettings, LatenessSettings, LocalizationSettings, TargetSettings, nanoseconds
 from network.endpoint import EndpointSettings
@@ -99,20 +110,25 @@ class LinksPart(Part):
 
 
 class SigmaPart(Part):
-    """Standard deviations of an initial belief."""
+    """Standard deviations of an initial belief: of x and y, and of what else the state has."""
 
     position_m: Positive
+    altitude_m: Positive | None = None
     heading_rad: Positive | None = None
     velocity_mps: Positive | None = None
+    acceleration_mps2: Positive | None = None
     gain_along: Positive | None = None
     gain_turn: Positive | None = None
 
     def covariance(self, model: str) -> np.ndarray[Any, np.dtype[np.float64]]:
         """Diagonal covariance of a state of `model`."""
-        keys = {
-            "unicycle": ["heading_rad"],
-            "unicycle_gains": ["heading_rad", "gain_along", "gain_turn"],
-        }.get(model, ["velocity_mps", "velocity_mps"])
+        layout = LAYOUTS[model]
+        keys = [] if layout.altitude is None else ["altitude_m"]
+        if layout.heading is not None:
+            keys += ["heading_rad", "gain_along", "gain_turn"][: layout.dim - len(layout.position)]
+        else:
+            axes = len(layout.position)
+            keys += [key for key in ("velocity_mps", "acceleration_mps2") for _ in range(axes)][: layout.dim - axes]
         sigmas = [self.position_m, self.position_m]
         for key in keys:
             sigma = getattr(self, key)
@@ -122,39 +138,82 @@ class SigmaPart(Part):
         return np.diag(np.square(sigmas))
 
 
-RobotModel = Literal["unicycle", "unicycle_gains"]
+RobotModel = Literal["unicycle", "unicycle_gains", "quadrotor", "planar_altitude"]
+TargetModel = Literal[
+    "unicycle",
+    "quadrotor",
+    "constant_velocity",
+    "damped_velocity",
+    "constant_velocity_3d",
+    "damped_velocity_3d",
+    "constant_acceleration",
+]
 
 
 class MotionPart(Part):
-    """How the robot moves with its odometry; the gains of `unicycle_gains` wander by `gain_walk_per_sqrt_s`."""
+    """How the robot moves with its odometry.
+
+    The gains of `unicycle_gains` wander by `gain_walk_per_sqrt_s`; a `quadrotor` holds `altitude_m` with the standard
+    deviation `altitude_sigma_m`.
+    """
 
     model: RobotModel = "unicycle"
     gain_walk_per_sqrt_s: NotNegative = 0.003
+    altitude_m: Finite = 0.0
+    altitude_sigma_m: NotNegative = 0.0
 
     def settings(self) -> RobotMotion:
-        if self.model == "unicycle_gains":
-            return GainMotion(walk=self.gain_walk_per_sqrt_s)
+        """Raises `ConfigError` for a held altitude without noise: nothing could be learnt of it."""
+        match self.model:
+            case "unicycle_gains":
+                return GainMotion(walk=self.gain_walk_per_sqrt_s)
+            case "quadrotor":
+                return SpatialMotion(held=held_altitude(self.altitude_m, self.altitude_sigma_m))
+            case "planar_altitude":
+                return SpatialMotion()
         return RobotMotion(LAYOUTS[self.model])
 
     def completed(self, mean: list[float]) -> np.ndarray[Any, np.dtype[np.float64]]:
         """An initial mean; of a pose alone the gains are 1. Raises `ConfigError` for another size."""
         dim = LAYOUTS[self.model].dim
-        if len(mean) not in (3, dim):
-            raise ConfigError(f"mean needs 3 numbers{f' or {dim}' if dim != 3 else ''} for the model '{self.model}'")
+        pose = start_size(LAYOUTS[self.model])
+        if len(mean) not in (pose, dim):
+            raise ConfigError(
+                f"mean needs {pose} numbers{f' or {dim}' if dim != pose else ''} for the model '{self.model}'"
+            )
         return np.array([*mean, *[1.0] * (dim - len(mean))])
 
 
+def held_altitude(altitude_m: float, sigma_m: float) -> HeldAltitude:
+    """Raises `ConfigError` without noise."""
+    if sigma_m <= 0.0:
+        raise ConfigError("a held altitude needs noise, altitude_m above 0: its covariance has to be invertible")
+    return HeldAltitude(altitude_m, sigma_m)
+
+
+def start_size(layout: StateLayout) -> int:
+    """Numbers of a start: a whole state, but for gains of an odometry, which start at 1."""
+    return 3 if layout.heading == 2 else layout.dim
+
+
 class ControlPart(Part):
+    """Commanded motion; `altitude_m` is held by the model `quadrotor`, others climb."""
+
     speed_mps: Finite = 0.0
     yaw_rate_radps: Finite = 0.0
+    climb_mps: Finite = 0.0
+    altitude_m: Finite = 0.0
 
 
 class ControlNoisePart(Part):
-    """White noise on a control, held over the scenario's step (1 sigma)."""
+    """White noise on a control, held over the scenario's step (1 sigma); on a held altitude, of each instant."""
 
     speed_mps: NotNegative = 0.0
     yaw_rate_radps: NotNegative = 0.0
+    climb_mps: NotNegative = 0.0
+    altitude_m: NotNegative = 0.0
     acceleration_mps2: NotNegative = 0.0
+    jerk_mps3: NotNegative = 0.0
 
 
 class OdometryPart(Part):
@@ -187,11 +246,48 @@ class CalibrationPart(Part):
         return Calibration(self.bias_m, dict(self.bias_of), self.scale, self.depth, self.bias_rad)
 
 
+SensorKind = Literal[
+    "range",
+    "bearing",
+    "bearing3",
+    "range_bearing",
+    "vector",
+    "pixel",
+    "position",
+    "pose",
+    "heading",
+    "altitude",
+]
+
+
+def _checked_mount(values: list[float]) -> list[float]:
+    if len(values) not in (3, 6):
+        raise PydanticCustomError("mount", "x, y, yaw or x, y, z, roll, pitch, yaw are needed")
+    return values
+
+
+MountVector = Annotated[list[Finite], AfterValidator(_checked_mount)]
+"""A sensor on the body: x, y [m], yaw [rad], or x, y, z [m], roll, pitch, yaw [rad]."""
+
+
+class IntrinsicsPart(Part):
+    """A pinhole camera; the principal point is the image's centre unless stated."""
+
+    focal_px: Positive = 500.0
+    size_px: Vector2 = [640.0, 480.0]
+    center_px: Vector2 | None = None
+
+    def settings(self) -> Intrinsics:
+        width, height = self.size_px
+        u, v = self.center_px or (0.5 * width, 0.5 * height)
+        return Intrinsics(self.focal_px, (u, v), (width, height))
+
+
 class AgentTargetPart(Part):
     """A target as a tracker knows it: common prior and model."""
 
     id: Id
-    model: Literal["unicycle", "constant_velocity", "damped_velocity"]
+    model: TargetModel
     mean: list[Finite]
     start_sigma: SigmaPart
     control: ControlPart = ControlPart()
@@ -214,16 +310,23 @@ class AgentTargetPart(Part):
 def target_motion(
     model: str, control: ControlPart, noise: ControlNoisePart, noise_step_s: float, damping_s: float
 ) -> TargetMotion:
-    """The motion model a table describes."""
-    if LAYOUTS[model].heading is not None:
-        sigma = (noise.speed_mps, noise.yaw_rate_radps)
-    else:
-        sigma = (noise.acceleration_mps2, noise.acceleration_mps2)
-    return TargetMotion(LAYOUTS[model], (control.speed_mps, control.yaw_rate_radps), sigma, noise_step_s, damping_s)
+    """The motion model a table describes. Raises `ConfigError` for a held altitude without noise."""
+    layout, held = LAYOUTS[model], None
+    sigma: tuple[float, ...] = (noise.speed_mps, noise.yaw_rate_radps)
+    if layout is SPATIAL:
+        held = held_altitude(control.altitude_m, noise.altitude_m)
+    elif layout.heading is None:
+        drive = noise.jerk_mps3 if model == "constant_acceleration" else noise.acceleration_mps2
+        sigma = (drive,) * len(layout.position)
+    steer = (control.speed_mps, control.yaw_rate_radps)
+    return TargetMotion(layout, steer, sigma, noise_step_s, damping_s, held=held)
 
 
 class LandmarkPart(Part):
-    """A point of known position, a UWB anchor for instance: x, y [m] in the fleet's ENU frame."""
+    """A point of known position, a UWB anchor for instance: x, y or x, y, z [m] in the fleet's ENU frame."""
 
     id: LandmarkId
-    position: Vector2
+    position: Point
+
+    def place(self) -> tuple[float, ...]:
+        return tuple(self.position)

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from agent.cooperative_filter import CooperativeFilter
 from agent.effects import Effect, Estimate, Publish
-from agent.estimation.observation import ABSOLUTE, RELATIVE_ANGLES, AbsoluteModel, RelativeModel
+from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError, absolute_model, relative_model, told
 from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received, Tick
 from agent.factor_filter import FactorFilter
 from agent.settings import AgentSettings
 from agent.timeline import Item, OdometryTrack, Phase, Timeline
-from network.messages import Measurement, PairReply, PairRequest
+from network.messages import PairReply, PairRequest
 
 Array = NDArray[np.float64]
 
@@ -161,6 +161,8 @@ class Agent:
             try:
                 self._advance(item.t_ns)
                 self._process(item, effects)
+            except OutOfViewError:
+                self.counters["observation.out_of_view"] += 1
             except np.linalg.LinAlgError:
                 self.counters["update.failed"] += 1
         while (end := self._odometry.next_end_ns(self.filter.t_ns)) is not None:
@@ -187,9 +189,9 @@ class Agent:
         if isinstance(event, Received):
             self.filter.requested(event, item.t_ns, effects)
         elif isinstance(event, Fix):
-            if event.kind in ABSOLUTE:
-                model = AbsoluteModel(event.kind, self.settings.layout)
-                self.filter.absolute(item.t_ns, event.kind, model, event.z, event.R)
+            fix = absolute_model(event.kind, self.settings.layout, event.z, event.R)
+            if fix is not None:
+                self.filter.absolute(item.t_ns, event.kind, *fix)
             else:
                 self.counters["fix.unused_kind"] += 1
         elif item.phase is Phase.PRIVATE:
@@ -206,7 +208,7 @@ class Agent:
         if position is None:
             self.counters["observation.unknown_landmark"] += 1
             return
-        model = RelativeModel(event.kind, self.settings.layout, event.mount, position)
+        model = relative_model(event, self.settings.layout, landmark=position)
         self.filter.absolute(t_ns, f"landmark_{event.kind}", model, event.z, event.R)
 
     def _contact(self, t_ns: int, event: Observation, effects: list[Effect]) -> None:
@@ -229,7 +231,7 @@ class Agent:
             if two_way and peer < self.settings.robot:
                 self.counters["pair.not_owner"] += 1
             else:
-                measurements.append(Measurement(found.kind, found.z, found.R, found.mount))
+                measurements.append(told(found))
         if not measurements:
             return
         self.filter.measured(peer, t_ns, self.now_ns, tuple(measurements), effects)

@@ -11,9 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from network.messages import Message
+from network.messages import NO_MOUNT, Message, Mount
 
 Array = NDArray[np.float64]
+
+LEVEL = (0.0, 0.0)
+"""Roll and pitch [rad] of a level body."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +39,7 @@ class Odometry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fix:
-    """Absolute information: kind `position` (x, y[, z]), `pose` (x, y, heading), `heading`, `altitude`."""
+    """Absolute information: kind `position` (x, y[, z]), `pose` (x, y[, z], heading), `heading`, `altitude`."""
 
     t_ns: int
     t_meas_ns: int
@@ -50,9 +53,10 @@ class Fix:
 class Observation:
     """A relative measurement of a subject: `r2`, `landmark:L3`, `target:t1`, or None (identity unknown).
 
-    kinds `range` (m), `bearing` (rad), `range_bearing` (m, rad), `vector` (x, y in m, forward and left); bearings are
-    counter-clockwise from the sensor's forward axis. `mount`: lever arm x, y [m, FLU] and yaw [rad] of the sensor on
-    the body.
+    kinds `range` (m), `bearing` (rad), `bearing3` (azimuth, elevation in rad), `range_bearing` (m, rad), `vector` (x,
+    y in m, forward and left), `pixel` (on the image plane at unit distance, right and down); azimuths are
+    counter-clockwise from the sensor's forward axis. `mount`: the sensor on the body; `attitude`: roll and pitch [rad]
+    of the body at the instant.
     """
 
     t_ns: int
@@ -62,7 +66,8 @@ class Observation:
     z: Array
     R: Array
     sensor: str = ""
-    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mount: Mount = NO_MOUNT
+    attitude: tuple[float, float] = LEVEL
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,9 +2,10 @@
 
     {"t_ns": int, "kind": "range", "of": "r2" | "landmark:L3" | "target:t1" | None, "z": [4.21], "R": [[0.0025]]}
 
-kinds `range`, `bearing` (azimuth), `range_bearing`, `vector` (x, y in the sensor's frame), `position`, `pose`,
-`heading`, and `odometry` (z = dx, dy, dz, dyaw over [t0_ns, t_ns]). Optional: "sensor" (its name in the config),
-"t0_ns" (odometry only). SI and radians, frames as in `agent.events`.
+kinds `range`, `bearing` (azimuth), `bearing3` (azimuth, elevation), `range_bearing`, `vector` (x, y in the sensor's
+frame), `pixel` (u, v in the image), `position` (x, y[, z]), `pose` (x, y[, z], heading), `heading`, `altitude`, and
+`odometry` (z = dx, dy, dz, dyaw over [t0_ns, t_ns]). Optional: "sensor" (its name in the config), "t0_ns" (odometry
+only), "attitude" (roll, pitch of the body at the instant). SI and radians, frames as in `agent.events`.
 """
 
 from __future__ import annotations
@@ -19,29 +20,37 @@ from numpy.typing import NDArray
 
 from agent.calibration import NO_CALIBRATION, Calibration, Form, corrected, formed
 from agent.estimation.gaussian import is_positive_definite
-from agent.events import Event, Fix, Observation, Odometry
+from agent.estimation.observation import Intrinsics
+from agent.events import LEVEL, Event, Fix, Observation, Odometry
+from network.messages import NO_MOUNT, Mount
 
 Array = NDArray[np.float64]
 
 MAX_DATAGRAM_BYTES = 2048
 MAX_VALUE = 1e9
+MAX_TILT = 1.5707963267948966
 FLOOR = 1e-12
 
-SIZES = {
-    "range": 1,
-    "bearing": 1,
-    "range_bearing": 2,
-    "vector": 2,
-    "position": 2,
-    "pose": 3,
-    "heading": 1,
-    "odometry": 4,
+SIZES: dict[str, tuple[int, ...]] = {
+    "range": (1,),
+    "bearing": (1,),
+    "bearing3": (2,),
+    "range_bearing": (2,),
+    "vector": (2,),
+    "pixel": (2,),
+    "position": (2, 3),
+    "pose": (3, 4),
+    "heading": (1,),
+    "altitude": (1,),
+    "odometry": (4,),
 }
-ABSOLUTE_KINDS = ("position", "pose", "heading")
+"""How many numbers a measurement of a kind may have."""
+
+ABSOLUTE_KINDS = ("position", "pose", "heading", "altitude")
 
 _SUBJECT = re.compile(r"(?:landmark:[A-Za-z0-9_.-]{1,32}|target:[a-z0-9-]{1,24}|[a-z0-9-]{1,24})\Z")
 _SENSOR = re.compile(r"[A-Za-z0-9_.-]{1,32}\Z")
-_KEYS = frozenset({"t_ns", "t0_ns", "kind", "of", "z", "R", "sensor"})
+_KEYS = frozenset({"t_ns", "t0_ns", "kind", "of", "z", "R", "sensor", "attitude"})
 
 
 class SensorError(Exception):
@@ -56,19 +65,23 @@ class SensorError(Exception):
 class SensorConfig:
     """What the robot knows of one of its sensors.
 
-    mount         where it sits on the body: x, y [m, FLU], yaw [rad]
+    mount         where it sits on the body: x, y, z [m, FLU], roll, pitch, yaw [rad]
     calibration   its systematic errors
     lag_ns        how much later than the instant of a measurement its stamp is
     form          how a range with a bearing is used
+    intrinsics    a camera's; without them its pixels are not used
     """
 
-    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mount: Mount = NO_MOUNT
     calibration: Calibration = NO_CALIBRATION
     lag_ns: int = 0
     form: Form = "polar"
+    intrinsics: Intrinsics | None = None
 
     def reading(self, kind: str, of: str | None, z: Array, R: Array) -> tuple[str, Array, Array]:
-        """(kind, z, R) of a measurement as it is used."""
+        """(kind, z, R) of a measurement as it is used; a pixel is taken to the image plane at unit distance."""
+        if kind == "pixel" and self.intrinsics is not None:
+            return kind, *self.intrinsics.normalized(z, R)
         return formed(kind, corrected(kind, of, z, self.calibration), R, self.form)
 
 
@@ -77,14 +90,24 @@ PLAIN = SensorConfig()
 
 
 def encode(
-    t_ns: int, kind: str, z: Array, R: Array, *, of: str | None = None, sensor: str = "", t0_ns: int | None = None
+    t_ns: int,
+    kind: str,
+    z: Array,
+    R: Array,
+    *,
+    of: str | None = None,
+    sensor: str = "",
+    t0_ns: int | None = None,
+    attitude: tuple[float, float] | None = None,
 ) -> bytes:
-    """The datagram a driver sends; z (m,), R (m, m)."""
+    """The datagram a driver sends; z (m,), R (m, m), `attitude` the body's roll and pitch [rad] if it is not level."""
     data: dict[str, Any] = {"t_ns": t_ns, "kind": kind, "of": of, "z": z.tolist(), "R": R.tolist()}
     if sensor:
         data["sensor"] = sensor
     if t0_ns is not None:
         data["t0_ns"] = t0_ns
+    if attitude is not None:
+        data["attitude"] = list(attitude)
     packed: bytes = msgpack.packb(data)
     return packed
 
@@ -116,9 +139,12 @@ def decode(payload: bytes, now_ns: int, sensors: dict[str, SensorConfig]) -> Eve
         raise SensorError("malformed")
     config = sensors.get(sensor, PLAIN)
     t_ns -= config.lag_ns
-    size = SIZES[kind]
-    z = _array(data.get("z"), (size,))
-    R = _array(data.get("R"), (size, size))
+    z = _array(data.get("z"), SIZES[kind])
+    size = len(z)
+    R = _matrix(data.get("R"), size)
+    roll, pitch = _array(data["attitude"], (2,)).tolist() if "attitude" in data else LEVEL
+    if max(abs(roll), abs(pitch)) >= MAX_TILT:
+        raise SensorError("out_of_range")
     of = data.get("of")
     about_itself = kind == "odometry" or kind in ABSOLUTE_KINDS
     if of is not None and (about_itself or type(of) is not str or not _SUBJECT.match(of)):
@@ -138,8 +164,10 @@ def decode(payload: bytes, now_ns: int, sensors: dict[str, SensorConfig]) -> Eve
         return Fix(now_ns, t_ns, kind, z, R, sensor)
     if kind in ("range", "range_bearing") and z[0] < 0.0:
         raise SensorError("out_of_range")
+    if kind == "pixel" and config.intrinsics is None:
+        raise SensorError("no_intrinsics")
     kind, z, R = config.reading(kind, of, z, R)
-    return Observation(now_ns, t_ns, kind, of, z, R, sensor, config.mount)
+    return Observation(now_ns, t_ns, kind, of, z, R, sensor, config.mount, (roll, pitch))
 
 
 def _stamp(value: Any) -> int:
@@ -148,15 +176,19 @@ def _stamp(value: Any) -> int:
     return value
 
 
-def _array(value: Any, shape: tuple[int, ...]) -> Array:
-    rows = value if len(shape) == 2 else [value]
-    if type(value) is not list or len(value) != shape[0]:
+def _matrix(value: Any, size: int) -> Array:
+    """(size, size) finite numbers."""
+    if type(value) is not list or len(value) != size:
         raise SensorError("wrong_length")
-    for row in rows:
-        if type(row) is not list or len(row) != shape[-1]:
-            raise SensorError("wrong_length")
-        if any(type(number) not in (int, float) for number in row):
-            raise SensorError("wrong_type")
+    return np.stack([_array(row, (size,)) for row in value])
+
+
+def _array(value: Any, sizes: tuple[int, ...]) -> Array:
+    """Finite numbers, as many as one of `sizes`."""
+    if type(value) is not list or len(value) not in sizes:
+        raise SensorError("wrong_length")
+    if any(type(number) not in (int, float) for number in value):
+        raise SensorError("wrong_type")
     array = np.array(value, dtype=np.float64)
     if not np.all(np.isfinite(array)) or np.any(np.abs(array) > MAX_VALUE):
         raise SensorError("out_of_range")

@@ -94,7 +94,7 @@ class AgentSettings:
     cov: Array
     motion: RobotMotion = PLANAR_MOTION
     targets: tuple[TargetSettings, ...] = ()
-    landmarks: dict[str, tuple[float, float]] = field(default_factory=dict)
+    landmarks: dict[str, tuple[float, ...]] = field(default_factory=dict)
     one_way_sensors: tuple[str, ...] = ()
     localization: LocalizationSettings = field(default_factory=LocalizationSettings)
     lateness: LatenessSettings = field(default_factory=LatenessSettings)

@@ -29,6 +29,12 @@ MAX_MEASUREMENTS = 8
 MAX_ECHOES = 16
 
 
+Mount = tuple[float, float, float, float, float, float]
+"""A sensor on a body: lever arm x, y, z [m, FLU], then roll, pitch, yaw [rad], turned in the order yaw, pitch, roll."""
+
+NO_MOUNT: Mount = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 class Channel:
     """Names of the channels of a robot's key space."""
 
@@ -138,13 +144,14 @@ class Snapshot:
 class Measurement:
     """A relative measurement of the receiver by the sender: z (m,), covariance R (m, m).
 
-    `mount` is the sensor's lever arm and turn on the sender's body: x, y [m, FLU], yaw [rad].
+    `mount` is the sensor on the sender's body, as if that were level at the instant. Of a `pixel`, z and R are on the
+    image plane at unit distance from the optical axis.
     """
 
     kind: str
     z: Array
     R: Array
-    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mount: Mount = NO_MOUNT
 
 
 class ReplyStatus(IntEnum):

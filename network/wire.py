@@ -42,8 +42,17 @@ from network.messages import (
     TargetBelief,
 )
 
-MODEL_DIMS = {"unicycle": 3, "unicycle_gains": 5, "constant_velocity": 4, "damped_velocity": 4}
-MEASUREMENT_DIMS = {"range": 1, "bearing": 1, "range_bearing": 2, "vector": 2}
+MODEL_DIMS = {
+    "unicycle": 3,
+    "unicycle_gains": 5,
+    "spatial": 4,
+    "constant_velocity": 4,
+    "damped_velocity": 4,
+    "constant_velocity_3d": 6,
+    "damped_velocity_3d": 6,
+    "constant_acceleration": 6,
+}
+MEASUREMENT_DIMS = {"range": 1, "bearing": 1, "bearing3": 2, "range_bearing": 2, "vector": 2, "pixel": 2}
 
 MAX_INT = 2**63 - 1
 MAX_ABS = 1e9
@@ -200,7 +209,7 @@ def _pack_measurement(measurement: Measurement) -> tuple[Any, ...]:
         m,
         _pack_array(measurement.z, (m,)),
         _pack_cov(measurement.R, m),
-        _pack_array(np.asarray(measurement.mount), (3,)),
+        _pack_array(np.asarray(measurement.mount), (6,)),
     )
 
 
@@ -391,8 +400,9 @@ def _measurement(raw: Any) -> Measurement:
         raise WireError("unknown_kind")
     if _integer(m) != dim:
         raise WireError("malformed")
-    x, y, yaw = _array(mount, 3).tolist()
-    return Measurement(kind, _array(z, dim), _cov(R, dim, SENSOR_FLOOR, "below_sensor_floor"), (x, y, yaw))
+    x, y, up, roll, pitch, yaw = _array(mount, 6).tolist()
+    cov = _cov(R, dim, SENSOR_FLOOR, "below_sensor_floor")
+    return Measurement(kind, _array(z, dim), cov, (x, y, up, roll, pitch, yaw))
 
 
 def _line(raw: Any, n: int) -> Line:

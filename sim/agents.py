@@ -44,7 +44,7 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
             "mean": [float(value) for value in mean],
             "start_sigma": table(robot.start_sigma),
         },
-        "motion": {"model": robot.model, "gain_walk_per_sqrt_s": robot.gain_walk_per_sqrt_s},
+        "motion": table(robot.motion()),
         "localization": table(scenario.localization_of(robot)),
         "tracking": table(scenario.tracking_of(robot)),
         "lateness": table(scenario.lateness_of(robot)),
@@ -58,11 +58,12 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
                 "calibration": table(sensor.calibration),
                 "lag_s": sensor.lag_s,
                 "form": sensor.form,
+                **({"intrinsics": table(sensor.intrinsics)} if sensor_kind(name, sensor) == "pixel" else {}),
             }
             for name, sensor in robot.sensors.items()
         },
         "targets": targets,
-        "landmarks": [{"id": name, "position": [float(x), float(y)]} for name, (x, y) in world.landmarks.items()],
+        "landmarks": [{"id": name, "position": [float(x) for x in place]} for name, place in world.landmarks.items()],
         "zenoh": {"listen": [], "peers": []},
         "state_dir": "state",
     }

@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.config_parts import MotionPart, target_motion
-from agent.events import Odometry
+from agent.events import LEVEL, Odometry
 from agent.sensor_input import SensorConfig
 from agent.settings import CoastSettings, nanoseconds
 from agent.timeline import OdometryTrack, Phase
@@ -72,11 +71,9 @@ class _Joint:
     def __init__(self, scenario: Scenario, world: World) -> None:
         robots, targets = {}, {}
         for robot in scenario.robots:
-            motion = MotionPart(model=robot.model, gain_walk_per_sqrt_s=robot.gain_walk_per_sqrt_s).settings()
-            robots[robot.id] = (*world.start_belief(robot.id), motion)
+            robots[robot.id] = (*world.start_belief(robot.id), robot.motion().settings())
         for target in scenario.targets:
-            drift = target_motion(target.model, target.control, target.noise, scenario.step_s, target.damping_s)
-            targets[target.id] = (*world.start_belief(target.id), drift)
+            targets[target.id] = (*world.start_belief(target.id), target.motion(scenario.step_s))
         self.filter = CentralizedFilter(
             robots,
             targets,
@@ -116,7 +113,8 @@ class _Joint:
             self._drift(item.t_ns)
         elif not item.of.startswith("landmark:"):
             self._advance(item.of, item.t_ns)
-        self.filter.observe(item.robot, item.kind, item.of, item.z, item.R, sensors[item.robot, item.sensor].mount)
+        mount, attitude = sensors[item.robot, item.sensor].mount, item.attitude or LEVEL
+        self.filter.observe(item.robot, item.kind, item.of, item.z, item.R, mount, attitude)
 
     def _thinned(self, item: Output, peer: str) -> bool:
         """Whether the pair met a moment ago; all measurements of one instant count as one meeting."""

@@ -6,6 +6,7 @@ statistically over the states they involve only, K = P[:, sub] H^T S^-1 with S =
 
 from __future__ import annotations
 
+import contextlib
 import copy
 
 import numpy as np
@@ -13,8 +14,10 @@ from numpy.typing import NDArray
 
 from agent.estimation.gaussian import gain, quadratic_form, symmetrize, wrap_components
 from agent.estimation.motion import RobotMotion, TargetMotion
-from agent.estimation.observation import AbsoluteModel, RelativeModel
+from agent.estimation.observation import AbsoluteModel, OutOfViewError, RelativeModel, absolute_model
 from agent.estimation.unscented import Propagated, Transform, observe
+from agent.events import LEVEL
+from network.messages import NO_MOUNT, Mount
 
 Array = NDArray[np.float64]
 
@@ -26,13 +29,15 @@ class CentralizedFilter:
         self,
         robots: dict[str, tuple[Array, Array, RobotMotion]],
         targets: dict[str, tuple[Array, Array, TargetMotion]],
-        landmarks: dict[str, tuple[float, float]],
+        landmarks: dict[str, tuple[float, ...]],
         transform: Transform = "unscented",
         innovation_cap: float = 0.0,
     ) -> None:
         self._landmarks, self._transform, self._cap = landmarks, transform, innovation_cap
         self._motions = {name: motion for name, (_, _, motion) in targets.items()}
         self._robot_motions = {name: motion for name, (_, _, motion) in robots.items()}
+        self._layouts = {name: motion.layout for name, motion in self._robot_motions.items()}
+        self._layouts |= {name: motion.layout for name, motion in self._motions.items()}
         self._parts: dict[str, slice] = {}
         starts = [(name, mean, cov, motion.layout) for name, (mean, cov, motion) in robots.items()]
         starts += [(name, mean, cov, motion.layout) for name, (mean, cov, motion) in targets.items()]
@@ -73,20 +78,31 @@ class CentralizedFilter:
             self._predict(name, motion.drift(*self.belief(name), dt_s, self._transform))
 
     def fix(self, robot: str, kind: str, z: Array, R: Array) -> None:
-        """Absolute information z (m,), R (m, m)."""
-        self._update(self._rows(robot), AbsoluteModel(kind, self._robot_motions[robot].layout), z, R)
+        """Absolute information z (m,), R (m, m); nothing happens if the robot's state has none of it."""
+        fix = absolute_model(kind, self._layouts[robot], z, R)
+        if fix is not None:
+            self._update(self._rows(robot), *fix)
 
     def observe(
-        self, robot: str, kind: str, of: str, z: Array, R: Array, mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        self,
+        robot: str,
+        kind: str,
+        of: str,
+        z: Array,
+        R: Array,
+        mount: Mount = NO_MOUNT,
+        attitude: tuple[float, float] = LEVEL,
     ) -> None:
-        """A relative measurement of `r2`, `landmark:L3` or `target:t1`."""
-        rows, layout = self._rows(robot), self._robot_motions[robot].layout
+        """A relative measurement of `r2`, `landmark:L3` or `target:t1`; a pixel of what is out of view is not used."""
+        rows, layout = self._rows(robot), self._layouts[robot]
         if of.startswith("landmark:"):
-            point = self._landmarks[of.removeprefix("landmark:")]
-            self._update(rows, RelativeModel(kind, layout, mount, point), z, R)
-            return
-        other = self._rows(of.removeprefix("target:"))
-        self._update(np.concatenate([rows, other]), RelativeModel(kind, layout, mount), z, R)
+            model = RelativeModel(kind, layout, mount, self._landmarks[of.removeprefix("landmark:")], attitude=attitude)
+        else:
+            name = of.removeprefix("target:")
+            rows = np.concatenate([rows, self._rows(name)])
+            model = RelativeModel(kind, layout, mount, subject=self._layouts[name], attitude=attitude)
+        with contextlib.suppress(OutOfViewError):
+            self._update(rows, model, z, R)
 
     def _rows(self, name: str) -> NDArray[np.intp]:
         part = self._parts[name]

@@ -227,7 +227,16 @@ class VirtualEngine:
             self._now = t_ns
             node = self._nodes[robot]
             if isinstance(what, Output):
-                payload = encode(t_ns, what.kind, what.z, what.R, of=what.of, sensor=what.sensor, t0_ns=what.t0_ns)
+                payload = encode(
+                    t_ns,
+                    what.kind,
+                    what.z,
+                    what.R,
+                    of=what.of,
+                    sensor=what.sensor,
+                    t0_ns=what.t0_ns,
+                    attitude=what.attitude,
+                )
                 self._carry_out(robot, node.on_sensor(t_ns, payload))
             elif isinstance(what, Packet):
                 self._carry_out(robot, node.on_packet(t_ns, what))

@@ -170,7 +170,9 @@ class WorldHost:
             self._servers[robot].push(t_ns)
 
     def _send_sensor(self, item: Output, t_ns: int) -> None:
-        payload = encode(t_ns, item.kind, item.z, item.R, of=item.of, sensor=item.sensor)
+        payload = encode(
+            t_ns, item.kind, item.z, item.R, of=item.of, sensor=item.sensor, attitude=item.attitude
+        )
         try:
             self._socket.sendto(payload, self._plan.sensor_sockets[item.robot])
         except OSError:

@@ -61,7 +61,9 @@ def components(trace: StateTrace) -> list[str]:
         elif index in trace.angles:
             found.append("heading_rad")
         else:
-            found.append(f"parameter_{others + 1}" if trace.angles else f"v{'xyz'[others]}_mps")
+            order, axis = divmod(others, len(trace.position))
+            moving = f"v{'xyz'[axis]}_mps" if order == 0 else f"a{'xyz'[axis]}_mps2"
+            found.append(f"parameter_{others + 1}" if trace.angles else moving)
             others += 1
     return found
 

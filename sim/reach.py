@@ -19,7 +19,7 @@ class Reach:
 
     def at(self, k: int) -> list[tuple[str, str]]:
         """(source, destination) pairs in range at instant k; instants are asked for in order."""
-        place = np.array([self._world.truth(robot, k)[:2] for robot in self._world.robots])
+        place = np.array([self._world.place(robot, k) for robot in self._world.robots])
         gaps = np.linalg.norm(place[:, None] - place[None], axis=-1)
         self._heard = hear(self._heard, gaps, self._range_m, self._hysteresis_m)
         ids = self._world.robots

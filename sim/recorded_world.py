@@ -52,7 +52,7 @@ class RecordedWorld:
         self._scenario, self._seed = scenario, seed
         self.robots = tuple(robot.id for robot in scenario.robots)
         self.targets = tuple(target.id for target in scenario.targets)
-        self.landmarks = dict(self._recording.landmarks)
+        self.landmarks: dict[str, tuple[float, ...]] = dict(self._recording.landmarks.items())
         self.step_ns = nanoseconds(scenario.step_s)
         self._start_ns = self._recording.start_ns
         self._check(path)
@@ -113,6 +113,9 @@ class RecordedWorld:
         if entity in self.targets:
             return np.append(pose[:2], self._recording.velocity_at(entity, t_ns))
         return pose
+
+    def place(self, entity: str, k: int) -> Array:
+        return np.append(self.truth(entity, k)[:2], 0.0)
 
     def outputs(self, k: int) -> list[Output]:
         found: list[Output] = []

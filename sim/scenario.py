@@ -6,7 +6,7 @@ import difflib
 import tomllib
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field
 
@@ -29,18 +29,24 @@ from agent.config_parts import (
     CoastPart,
     ControlNoisePart,
     ControlPart,
+    IntrinsicsPart,
     LandmarkPart,
     LatenessPart,
     LinksPart,
     LocalizationPart,
+    MotionPart,
+    MountVector,
     NetworkPart,
     OdometryPart,
     RobotModel,
+    SensorKind,
     SigmaPart,
+    TargetModel,
     TrackingPart,
+    target_motion,
 )
-from agent.estimation.motion import LAYOUTS
-from agent.estimation.observation import RELATIVE_ANGLES
+from agent.estimation.motion import LAYOUTS, TargetMotion
+from agent.estimation.observation import RELATIVE_ANGLES, mount_of
 from agent.sensor_input import SensorConfig
 from agent.settings import nanoseconds
 
@@ -76,26 +82,32 @@ class CirclePart(Part):
 
 
 class StartPart(Part):
-    """True start: a pose (x, y, heading), a full target state, or a place on a circle drawn from the seed."""
+    """True start: a pose (x, y[, z], heading), a full target state, or a place on a circle drawn from the seed."""
 
-    pose: Annotated[list[Finite], Field(min_length=3, max_length=4)] | None = None
+    pose: Annotated[list[Finite], Field(min_length=3, max_length=6)] | None = None
     circle: CirclePart | None = None
 
 
 class SensorPart(Part):
     """A sensor: what it measures (`kind`, by default its name), of whom, how well, how far and how often.
 
-    sigma_m grows by sigma_m_per_m with the distance. `rate_hz` absent: once per step.
+    sigma_m grows by sigma_m_per_m with the distance; sigma_z_m is that of an altitude, sigma_m by default. `rate_hz`
+    absent: once per step. Simulated ranges are too long by `bias_m`, or by what `bias_of` says of the subject.
     """
 
-    kind: Literal["range", "bearing", "range_bearing", "vector", "position", "pose", "heading"] | None = None
+    kind: SensorKind | None = None
     of: list[Subject] = []
     sigma_m: Positive | None = None
     sigma_m_per_m: NotNegative = 0.0
+    sigma_z_m: Positive | None = None
     sigma_rad: Positive | None = None
+    sigma_px: Positive | None = None
+    bias_m: Finite = 0.0
+    bias_of: dict[str, Finite] = {}
     max_range_m: Positive | None = None
     rate_hz: Positive | None = None
-    mount: Vector3 = [0.0, 0.0, 0.0]
+    mount: MountVector = [0.0, 0.0, 0.0]
+    intrinsics: IntrinsicsPart = IntrinsicsPart()
     two_way: bool = True
     calibration: CalibrationPart = CalibrationPart()
     lag_s: Finite = 0.0
@@ -110,6 +122,8 @@ class AutopilotPart(Part):
 
 
 class RobotPart(Part):
+    """A robot; `tilt_rad` is the standard deviation of its roll and pitch, new at every instant and known to it."""
+
     id: Id
     model: RobotModel = "unicycle"
     gain_walk_per_sqrt_s: NotNegative = 0.003
@@ -118,22 +132,36 @@ class RobotPart(Part):
     control: ControlPart = ControlPart()
     noise: ControlNoisePart = ControlNoisePart()
     odometry: OdometryPart | None = None
+    tilt_rad: NotNegative = 0.0
     sensors: dict[str, SensorPart] = {}
     autopilot: AutopilotPart = AutopilotPart()
     localization: dict[str, Any] = {}
     tracking: dict[str, Any] = {}
     lateness: dict[str, Any] = {}
 
+    def motion(self) -> MotionPart:
+        """How an estimator takes the robot to move."""
+        return MotionPart(
+            model=self.model,
+            gain_walk_per_sqrt_s=self.gain_walk_per_sqrt_s,
+            altitude_m=self.control.altitude_m,
+            altitude_sigma_m=self.noise.altitude_m,
+        )
+
 
 class TargetPart(Part):
     id: Id
-    model: Literal["unicycle", "constant_velocity", "damped_velocity"] = "unicycle"
+    model: TargetModel = "unicycle"
     recorded: bool = False
     start: StartPart = StartPart()
     start_sigma: SigmaPart
     control: ControlPart = ControlPart()
     noise: ControlNoisePart = ControlNoisePart()
     damping_s: Positive = 2.0
+
+    def motion(self, step_s: float) -> TargetMotion:
+        """How an estimator takes the target to move."""
+        return target_motion(self.model, self.control, self.noise, step_s, self.damping_s)
 
 
 class CentralizedPart(Part):
@@ -297,7 +325,7 @@ def check(scenario: Scenario) -> None:
             f"there are: {', '.join(circling)}"
         )
     for robot in scenario.robots:
-        _check_sigma(f"{scenario.name}: robots.{robot.id}", robot)
+        _check_mover(f"{scenario.name}: robots.{robot.id}", robot)
         scenario.localization_of(robot), scenario.lateness_of(robot), scenario.tracking_of(robot)
         if not recorded and (robot.start.pose is None) == (robot.start.circle is None):
             raise ConfigError(f"{scenario.name}: robots.{robot.id}.start needs either 'pose' or 'circle'")
@@ -307,7 +335,7 @@ def check(scenario: Scenario) -> None:
             where = f"{scenario.name}: robots.{robot.id}.sensors.{name}"
             check_sensor(where, name, sensor)
     for target in scenario.targets:
-        _check_sigma(f"{scenario.name}: targets.{target.id}", target)
+        _check_mover(f"{scenario.name}: targets.{target.id}", target)
         if target.recorded != recorded:
             raise ConfigError(
                 f"{scenario.name}: targets.{target.id}.recorded = {str(recorded).lower()} is needed in a "
@@ -322,14 +350,22 @@ def check(scenario: Scenario) -> None:
             raise ConfigError(f"{scenario.name}: targets.{target.id}.start.pose is missing")
 
 
-def _check_sigma(where: str, part: RobotPart | TargetPart) -> None:
+def _check_mover(where: str, part: RobotPart | TargetPart) -> None:
+    """Deviations of the start, altitude noise and size of the pose are those the model needs."""
     try:
         part.start_sigma.covariance(part.model)
     except ConfigError as error:
         raise ConfigError(f"{where}.{error}") from None
+    try:
+        if isinstance(part, RobotPart):
+            part.motion().settings()
+        else:
+            part.motion(1.0)
+    except ConfigError as error:
+        raise ConfigError(f"{where}.noise: {error}") from None
 
 
-KINDS = ("range", "bearing", "range_bearing", "vector", "position", "pose", "heading")
+KINDS: tuple[str, ...] = get_args(SensorKind)
 
 
 def sensor_kind(name: str, sensor: SensorPart) -> str:
@@ -339,8 +375,13 @@ def sensor_kind(name: str, sensor: SensorPart) -> str:
 
 def sensor_config(sensor: SensorPart) -> SensorConfig:
     """The sensor as an estimator knows it."""
-    x, y, yaw = sensor.mount
-    return SensorConfig((x, y, yaw), sensor.calibration.settings(), nanoseconds(sensor.lag_s), sensor.form)
+    return SensorConfig(
+        mount_of(sensor.mount),
+        sensor.calibration.settings(),
+        nanoseconds(sensor.lag_s),
+        sensor.form,
+        sensor.intrinsics.settings(),
+    )
 
 
 def check_sensor(where: str, name: str, sensor: SensorPart) -> None:
@@ -349,10 +390,14 @@ def check_sensor(where: str, name: str, sensor: SensorPart) -> None:
     if kind not in KINDS:
         raise ConfigError(f"{where}: state its kind, one of {', '.join(KINDS)}")
     needs_m = kind in ("range", "range_bearing", "vector", "position", "pose")
-    needs_rad = kind in ("bearing", "range_bearing", "pose", "heading")
+    needs_rad = kind in ("bearing", "bearing3", "range_bearing", "pose", "heading")
     if needs_m and sensor.sigma_m is None:
         raise ConfigError(f"{where}: sigma_m is missing")
     if needs_rad and sensor.sigma_rad is None:
         raise ConfigError(f"{where}: sigma_rad is missing")
+    if kind == "altitude" and sensor.sigma_m is None and sensor.sigma_z_m is None:
+        raise ConfigError(f"{where}: sigma_z_m is missing")
+    if kind == "pixel" and sensor.sigma_px is None:
+        raise ConfigError(f"{where}: sigma_px is missing")
     if kind in RELATIVE_ANGLES and not sensor.of:
         raise ConfigError(f'{where}: of is missing, for instance of = ["peers"]')

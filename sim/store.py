@@ -32,10 +32,10 @@ def save_trace(
     run_dir: Path,
     trace: TrialTrace,
     contacts: list[tuple[float, str, str]],
-    landmarks: dict[str, tuple[float, float]],
+    landmarks: dict[str, tuple[float, ...]],
     measured: Instants | None = None,
 ) -> None:
-    """Write `trace.npz`. Instants are kept to the microsecond as gaps, which are nearly all alike and so pack well."""
+    """Write `trace.npz`, of landmarks x and y. Instants are kept to the microsecond as gaps, which are nearly all alike and so pack well."""
     arrays: dict[str, Any] = {"t_s": trace.t_s}
     index: list[dict[str, Any]] = []
 
@@ -57,7 +57,7 @@ def save_trace(
     meta = {
         "index": index,
         "contacts": contacts,
-        "landmarks": landmarks,
+        "landmarks": {name: place[:2] for name, place in landmarks.items()},
         "bound": trace.bound is not None,
         "measured": list(measured or {}),
     }

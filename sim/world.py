@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.config_file import ConfigError
+from agent.config_parts import start_size
 from agent.estimation.gain_motion import reported
 from agent.estimation.gaussian import wrap, wrap_components
-from agent.estimation.motion import LAYOUTS, UNICYCLE_GAINS, compose, velocity_step
-from agent.estimation.observation import RELATIVE_ANGLES, RelativeModel
+from agent.estimation.motion import LAYOUTS, SPATIAL, UNICYCLE_GAINS, StateLayout, compose, velocity_step
+from agent.estimation.observation import (
+    RELATIVE_ANGLES,
+    AbsoluteModel,
+    OutOfViewError,
+    RelativeModel,
+    mount_of,
+)
 from agent.estimation.odometry import OdometryNoise
+from agent.events import LEVEL
 from agent.settings import NS, nanoseconds
 from agent.timeline import Phase
 from sim.noise import generator, normal_rows
@@ -24,7 +32,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Output:
-    """One sensor datum at `t_ns` since the start; odometry covers [t0_ns, t_ns]."""
+    """One sensor datum at `t_ns` since the start; odometry covers [t0_ns, t_ns].
+
+    `attitude` is the roll and pitch [rad] the robot tells with it; None: level.
+    """
 
     t_ns: int
     phase: Phase
@@ -35,6 +46,7 @@ class Output:
     z: Array
     R: Array
     t0_ns: int | None = None
+    attitude: tuple[float, float] | None = None
 
 
 class World(Protocol):
@@ -42,7 +54,7 @@ class World(Protocol):
 
     robots: tuple[str, ...]
     targets: tuple[str, ...]
-    landmarks: dict[str, tuple[float, float]]
+    landmarks: dict[str, tuple[float, ...]]
     steps: int
     step_ns: int
 
@@ -52,6 +64,10 @@ class World(Protocol):
 
     def truth(self, entity: str, k: int) -> Array:
         """True state (n,) at instant k."""
+        ...
+
+    def place(self, entity: str, k: int) -> Array:
+        """True x, y, z (3,) at instant k; what is planar lies at z = 0."""
         ...
 
     def outputs(self, k: int) -> list[Output]:
@@ -66,7 +82,7 @@ def control_odometry(robot: RobotPart, step_s: float) -> OdometryNoise:
     root = float(np.sqrt(step_s))
     return OdometryNoise(
         along_m_per_sqrt_s=robot.noise.speed_mps * root,
-        vertical_m_per_sqrt_s=0.0,
+        vertical_m_per_sqrt_s=robot.noise.climb_mps * root,
         heading_rad_per_sqrt_s=robot.noise.yaw_rate_radps * root,
     )
 
@@ -86,20 +102,24 @@ def phase_of(of: str | None) -> Phase:
 def relative_noise(kind: str, sensor: SensorPart, distance_m: float) -> Array:
     """R (m, m) of a relative measurement at a distance."""
     sigma_m = (sensor.sigma_m or 0.0) + sensor.sigma_m_per_m * distance_m
-    sigma_rad = sensor.sigma_rad or 0.0
+    sigma_rad, sigma_px = sensor.sigma_rad or 0.0, sensor.sigma_px or 0.0
     diagonal = {
         "range": [sigma_m],
         "bearing": [sigma_rad],
+        "bearing3": [sigma_rad, sigma_rad],
+        "pixel": [sigma_px, sigma_px],
         "range_bearing": [sigma_m, sigma_rad],
         "vector": [sigma_m, sigma_m],
     }[kind]
     return np.diag(np.square(diagonal))
 
 
-def absolute_noise(kind: str, sensor: SensorPart) -> Array:
-    """R (m, m) of an absolute fix."""
+def absolute_noise(kind: str, sensor: SensorPart, spatial: bool = False) -> Array:
+    """R (m, m) of an absolute fix; `spatial` ones have an altitude."""
     m, rad = sensor.sigma_m or 0.0, sensor.sigma_rad or 0.0
-    return np.diag(np.square({"position": [m, m], "pose": [m, m, rad], "heading": [rad]}[kind]))
+    z = m if sensor.sigma_z_m is None else sensor.sigma_z_m
+    place = [m, m, z] if spatial else [m, m]
+    return np.diag(np.square({"position": place, "pose": [*place, rad], "heading": [rad], "altitude": [z]}[kind]))
 
 
 class SimulatedWorld:
@@ -113,7 +133,7 @@ class SimulatedWorld:
         self._scenario, self._seed = scenario, seed
         self.robots = tuple(robot.id for robot in scenario.robots)
         self.targets = tuple(target.id for target in scenario.targets)
-        self.landmarks = {item.id: (item.position[0], item.position[1]) for item in scenario.landmarks}
+        self.landmarks = {item.id: item.place() for item in scenario.landmarks}
         self.step_ns = nanoseconds(scenario.step_s)
         self.steps = round(scenario.duration_s * NS) // self.step_ns
         phases = draw_phases(scenario, seed)
@@ -123,34 +143,39 @@ class SimulatedWorld:
         for target in scenario.targets:
             assert target.start.pose is not None
             self._tracks[target.id] = self._drive(target, np.array(target.start.pose))
+        self._tilt = {
+            robot.id: robot.tilt_rad * normal_rows(seed, self.steps + 1, 2, robot.id, "attitude")
+            for robot in scenario.robots
+            if robot.tilt_rad > 0.0
+        }
         self._sensor_noise: dict[tuple[str, str, str], Array] = {}
 
     def _drive(self, mover: RobotPart | TargetPart, start: Array) -> Array:
         """True states (steps + 1, n)."""
         layout = LAYOUTS[mover.model]
-        size = layout.dim if layout.heading is None else 3
+        size = start_size(layout)
         if len(start) != size:
             raise ConfigError(f"{self._scenario.name}: {mover.id}.start.pose needs {size} numbers for '{mover.model}'")
+        if layout.heading is None:
+            assert isinstance(mover, TargetPart)
+            return self._drift(mover, layout, start)
         dt = self._scenario.step_s
         noise = normal_rows(self._seed, self.steps, 2, mover.id, "control")
         track = np.zeros((self.steps + 1, layout.dim))
         track[0] = [*start, *[1.0] * (layout.dim - size)]
-        if layout.heading is None:
-            assert isinstance(mover, TargetPart)
-            F, Q = velocity_step(layout, dt, mover.damping_s)
-            root = np.linalg.cholesky(Q[np.ix_((0, 2), (0, 2))]) * mover.noise.acceleration_mps2 * np.sqrt(dt)
-            more = normal_rows(self._seed, self.steps, 2, mover.id, "acceleration")
-            for k in range(self.steps):
-                track[k + 1] = F @ track[k]
-                for axis in (0, 1):
-                    track[k + 1, [axis, axis + 2]] += root @ np.array([noise[k, axis], more[k, axis]])
-            return track
         control = np.array([mover.control.speed_mps, mover.control.yaw_rate_radps])
         sigma = np.array([mover.noise.speed_mps, mover.noise.yaw_rate_radps])
         moves = dt * (control + sigma * noise)
+        pose = [0, 1, layout.heading]
         for k in range(self.steps):
-            track[k + 1, :3] = compose(track[k, :3], np.array([moves[k, 0], 0.0, moves[k, 1]]))
-        track[:, 2] = wrap(track[:, 2])
+            track[k + 1, pose] = compose(track[k, pose], np.array([moves[k, 0], 0.0, moves[k, 1]]))
+        track[:, layout.heading] = wrap(track[:, layout.heading])
+        if layout is SPATIAL:
+            up = normal_rows(self._seed, self.steps, 1, mover.id, "altitude")[:, 0]
+            if mover.model == "quadrotor":
+                track[1:, 2] = mover.control.altitude_m + mover.noise.altitude_m * up
+            else:
+                track[1:, 2] = start[2] + dt * np.cumsum(mover.control.climb_mps + mover.noise.climb_mps * up)
         if layout is UNICYCLE_GAINS:
             assert isinstance(mover, RobotPart)
             walk = mover.gain_walk_per_sqrt_s * np.sqrt(dt)
@@ -158,8 +183,28 @@ class SimulatedWorld:
             track[1:, 3:] += walk * np.cumsum(steps, axis=0) + 1.0
         return track
 
+    def _drift(self, target: TargetPart, layout: StateLayout, start: Array) -> Array:
+        """True states (steps + 1, n) of a target that is pushed at random."""
+        dt, axes = self._scenario.step_s, len(layout.position)
+        F, Q = velocity_step(layout, dt, target.damping_s)
+        (sigma, *_), order = target.motion(dt).noise_sigma, layout.dim // axes
+        root = np.linalg.cholesky(Q[::axes, ::axes]) * sigma * np.sqrt(dt)
+        names = ("control", "acceleration", "jerk")[:order]
+        draws = np.stack([normal_rows(self._seed, self.steps, axes, target.id, name) for name in names], axis=1)
+        track = np.zeros((self.steps + 1, layout.dim))
+        track[0] = start
+        for k in range(self.steps):
+            track[k + 1] = F @ track[k] + (root @ draws[k]).ravel()
+        return track
+
     def truth(self, entity: str, k: int) -> Array:
         return np.asarray(self._tracks[entity][k])
+
+    def place(self, entity: str, k: int) -> Array:
+        layout = LAYOUTS[self._scenario.movers()[entity].model]
+        place = np.zeros(3)
+        place[: len(layout.position)] = self._tracks[entity][k, : len(layout.position)]
+        return place
 
     def start_belief(self, entity: str) -> tuple[Array, Array]:
         part = self._scenario.movers()[entity]
@@ -183,7 +228,8 @@ class SimulatedWorld:
 
     def _odometry(self, robot: RobotPart, k: int) -> Output:
         dt = self._scenario.step_s
-        delta = np.array([robot.control.speed_mps * dt, 0.0, 0.0, robot.control.yaw_rate_radps * dt])
+        control = robot.control
+        delta = dt * np.array([control.speed_mps, 0.0, control.climb_mps, control.yaw_rate_radps])
         noise = control_odometry(robot, dt)
         if LAYOUTS[robot.model] is UNICYCLE_GAINS:
             delta[[0, 1, 3]] = reported(self._tracks[robot.id][k - 1], delta[[0, 1, 3]])
@@ -200,40 +246,65 @@ class SimulatedWorld:
 
     def _sense(self, robot: RobotPart, name: str, sensor: SensorPart, k: int) -> list[Output]:
         kind, state, t_ns = sensor_kind(name, sensor), self._tracks[robot.id][k], k * self.step_ns
+        layout = LAYOUTS[robot.model]
         if kind not in RELATIVE_ANGLES:
-            R = absolute_noise(kind, sensor)
-            clean = {"position": state[:2], "pose": state, "heading": state[2:]}[kind]
-            z = clean + np.sqrt(np.diagonal(R)) * self._noise(robot.id, name, "", k, len(R))
-            if kind != "position":
-                z[-1] = wrap(z[-1])
-            return [Output(t_ns, Phase.PRIVATE, robot.id, name, kind, None, z, R)]
+            R = absolute_noise(kind, sensor, layout is SPATIAL)
+            fix = AbsoluteModel(kind, layout, len(R))
+            z = fix.h(state) + np.sqrt(np.diagonal(R)) * self._noise(robot.id, name, "", k, len(R))
+            return [Output(t_ns, Phase.PRIVATE, robot.id, name, kind, None, wrap_components(z, fix.angles), R)]
         outputs = []
-        for of, position in self._subjects(robot, sensor, kind, k):
-            model = RelativeModel(kind, LAYOUTS[robot.model], (sensor.mount[0], sensor.mount[1], sensor.mount[2]))
-            joint = np.concatenate([state, position])
-            distance = float(RelativeModel("range", LAYOUTS[robot.model], model.mount).h(joint)[0])
+        attitude = self._attitude(robot.id, k)
+        intrinsics = sensor.intrinsics.settings()
+        for of, subject, place in self._subjects(robot, sensor, kind, k):
+            model = RelativeModel(
+                kind,
+                layout,
+                mount_of(sensor.mount),
+                tuple(place.tolist()) if subject is None else None,
+                subject or layout,
+                attitude or LEVEL,
+                intrinsics,
+            )
+            joint = state if subject is None else np.concatenate([state, place])
+            distance = float(replace(model, kind="range").h(joint)[0])
             if sensor.max_range_m is not None and distance > sensor.max_range_m:
                 continue
+            try:
+                clean = model.h(joint)
+            except OutOfViewError:
+                continue
+            if kind == "pixel" and not intrinsics.shows(clean):
+                continue
             R = relative_noise(kind, sensor, distance)
-            z = model.h(joint) + np.sqrt(np.diagonal(R)) * self._noise(robot.id, name, of, k, len(R))
-            for index in model.angles:
-                z[index] = wrap(z[index])
+            z = clean + np.sqrt(np.diagonal(R)) * self._noise(robot.id, name, of, k, len(R))
+            wrap_components(z, model.angles)
             if kind in ("range", "range_bearing"):
-                z[0] = max(z[0], 0.0)
-            outputs.append(Output(t_ns, phase_of(of), robot.id, name, kind, of, z, R))
+                z[0] = max(z[0] + sensor.bias_of.get(of, sensor.bias_m), 0.0)
+            outputs.append(Output(t_ns, phase_of(of), robot.id, name, kind, of, z, R, attitude=attitude))
         return outputs
 
-    def _subjects(self, robot: RobotPart, sensor: SensorPart, kind: str, k: int) -> list[tuple[str, Array]]:
-        subjects: list[tuple[str, Array]] = []
+    def _attitude(self, robot: str, k: int) -> tuple[float, float] | None:
+        """Roll and pitch [rad], within what is told of them; None: level."""
+        if robot not in self._tilt:
+            return None
+        roll, pitch = np.clip(self._tilt[robot][k], -1.5, 1.5).tolist()
+        return roll, pitch
+
+    def _subjects(
+        self, robot: RobotPart, sensor: SensorPart, kind: str, k: int
+    ) -> list[tuple[str, StateLayout | None, Array]]:
+        """Name, layout (None: a landmark) and true state or place of what a sensor may see."""
+        subjects: list[tuple[str, StateLayout | None, Array]] = []
         if "peers" in sensor.of:
             for peer in self._scenario.robots:
                 shared = kind == "range" and sensor.two_way and _ranges_peers(peer) and peer.id < robot.id
                 if peer.id != robot.id and not shared:
-                    subjects.append((peer.id, self._tracks[peer.id][k, :2]))
+                    subjects.append((peer.id, LAYOUTS[peer.model], self._tracks[peer.id][k]))
         if "landmarks" in sensor.of:
-            subjects += [(f"landmark:{name}", np.array(point)) for name, point in self.landmarks.items()]
+            subjects += [(f"landmark:{name}", None, np.array(point)) for name, point in self.landmarks.items()]
         if "targets" in sensor.of:
-            subjects += [(f"target:{name}", self._tracks[name][k, :2]) for name in self.targets]
+            for target in self._scenario.targets:
+                subjects.append((f"target:{target.id}", LAYOUTS[target.model], self._tracks[target.id][k]))
         return subjects
 
 
@@ -257,14 +328,15 @@ def drawn_belief(truth: Array, cov: Array, seed: int, entity: str, angles: tuple
 
 
 def start_pose(robot: RobotPart, phases: dict[str, float]) -> Array:
-    """True start of a robot; on a circle it heads along the tangent, counter-clockwise."""
+    """True start of a robot; on a circle it heads along the tangent, counter-clockwise, at its commanded altitude."""
     if robot.start.circle is None:
         assert robot.start.pose is not None
         return np.array(robot.start.pose)
     phase, circle = phases[robot.id], robot.start.circle
     x = circle.center_m[0] + circle.radius_m * np.cos(phase)
     y = circle.center_m[1] + circle.radius_m * np.sin(phase)
-    return np.array([x, y, float(wrap(np.array(phase + np.pi / 2.0)))])
+    altitude = [robot.control.altitude_m] if LAYOUTS[robot.model] is SPATIAL else []
+    return np.array([x, y, *altitude, float(wrap(np.array(phase + np.pi / 2.0)))])
 
 
 def draw_phases(scenario: Scenario, seed: int) -> dict[str, float]:

@@ -21,8 +21,8 @@ from agent.estimation.gaussian import (
     wrap_components,
 )
 from agent.estimation.intersection import Weight, best_inflated_update
-from agent.estimation.motion import StateLayout
-from agent.estimation.observation import AbsoluteModel, RelativeModel
+from agent.estimation.motion import STATES, StateLayout
+from agent.estimation.observation import AbsoluteModel, RelativeModel, relative_model
 from agent.estimation.unscented import Predicted, Transform, UnscentedParameters, observe
 from network.messages import NEVER, Measurement, Snapshot
 
@@ -211,14 +211,13 @@ def contact(
     responder: Snapshot,
     initiator_is_low: bool,
     measurements: Sequence[Measurement],
-    layout: StateLayout,
     correlated: bool,
     options: Options,
 ) -> Contact:
     """Innovation and gains of a pair update (UT-CLAT 3.3, eq. 18-25 with priors in S and full gains).
 
-    Both beliefs are of `layout`. `correlated` False takes P_ij = 0 (the naive baseline). Raises
-    `numpy.linalg.LinAlgError` for beliefs that are not positive definite.
+    The beliefs may be of different states. `correlated` False takes P_ij = 0 (the naive baseline). Raises
+    `numpy.linalg.LinAlgError` for beliefs that are not positive definite, and if the subject is out of view.
     """
     P_i, P_j = initiator.belief.cov, responder.belief.cov
     n, m = len(P_i), len(P_j)
@@ -237,7 +236,8 @@ def contact(
         if not is_positive_definite(joint):
             cross = clip_canonical_correlations(P_i, cross, P_j)
             joint[:n, n:], joint[n:, :n] = cross, cross.T
-    models = [RelativeModel(item.kind, layout, item.mount) for item in measurements]
+    observer, subject = STATES[initiator.belief.model], STATES[responder.belief.model]
+    models = [relative_model(item, observer, subject) for item in measurements]
     model = models[0] if len(models) == 1 else StackedModel(models, [len(item.z) for item in measurements])
     z = np.concatenate([item.z for item in measurements])
     R = np.zeros((len(z), len(z)))

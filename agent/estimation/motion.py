@@ -1,7 +1,8 @@
 """Motion models: what a state means and how it moves.
 
 A robot's own state is driven by odometry increments (`advance`); a target by its model alone (`drift`).
-Planar states are x, y, heading (unicycle) or x, y, vx, vy; ENU, heading counter-clockwise from east.
+States are ENU positions x, y[, z] followed by a heading, counter-clockwise from east, or by velocities. Roll and pitch
+are no states: odometry increments are of the levelled body.
 """
 
 from __future__ import annotations
@@ -23,7 +24,10 @@ PLANAR = (0, 1, 3)
 
 @dataclass(frozen=True, slots=True)
 class StateLayout:
-    """Meaning of a state vector: its size, wrapped components, where heading (None: none) and position sit."""
+    """Meaning of a state vector: its size, wrapped components, where heading (None: none) and position sit.
+
+    The position is the first two components, or three with an altitude.
+    """
 
     name: str
     dim: int
@@ -31,13 +35,41 @@ class StateLayout:
     heading: int | None
     position: tuple[int, ...] = (0, 1)
 
+    @property
+    def altitude(self) -> int | None:
+        """Where the altitude sits; None for a planar state."""
+        return self.position[2] if len(self.position) == 3 else None
+
 
 UNICYCLE = StateLayout("unicycle", 3, (2,), 2)
 UNICYCLE_GAINS = StateLayout("unicycle_gains", 5, (2,), 2)
+SPATIAL = StateLayout("spatial", 4, (3,), 3, (0, 1, 2))
 CONSTANT_VELOCITY = StateLayout("constant_velocity", 4, (), None)
 DAMPED_VELOCITY = StateLayout("damped_velocity", 4, (), None)
+CONSTANT_VELOCITY_3D = StateLayout("constant_velocity_3d", 6, (), None, (0, 1, 2))
+DAMPED_VELOCITY_3D = StateLayout("damped_velocity_3d", 6, (), None, (0, 1, 2))
+CONSTANT_ACCELERATION = StateLayout("constant_acceleration", 6, (), None)
 
-LAYOUTS = {layout.name: layout for layout in (UNICYCLE, UNICYCLE_GAINS, CONSTANT_VELOCITY, DAMPED_VELOCITY)}
+STATES = {
+    layout.name: layout
+    for layout in (
+        UNICYCLE,
+        UNICYCLE_GAINS,
+        SPATIAL,
+        CONSTANT_VELOCITY,
+        DAMPED_VELOCITY,
+        CONSTANT_VELOCITY_3D,
+        DAMPED_VELOCITY_3D,
+        CONSTANT_ACCELERATION,
+    )
+}
+"""State layouts by the name beliefs carry."""
+
+LAYOUTS = {name: layout for name, layout in STATES.items() if layout is not SPATIAL} | {
+    "quadrotor": SPATIAL,
+    "planar_altitude": SPATIAL,
+}
+"""State layouts by the name of a model of motion."""
 
 
 def compose(pose: Array, delta: Array) -> Array:
@@ -103,8 +135,60 @@ def advance(
 
 
 @dataclass(frozen=True, slots=True)
+class HeldAltitude:
+    """An altitude that a vehicle holds: commanded, with a deviation that is new at every instant."""
+
+    altitude_m: float
+    sigma_m: float
+
+
+def advance_spatial(
+    mean: Array,
+    cov: Array,
+    delta: Array,
+    delta_cov: Array,
+    transform: Transform,
+    parameters: UnscentedParameters = DEFAULT,
+    held: HeldAltitude | None = None,
+) -> Propagated:
+    """Move a belief of x, y, z, heading (4,), (4, 4) by an odometry increment (4,) with covariance (4, 4).
+
+    The altitude is that before plus the increment's; with `held` it is the held one instead, z' = z_c + w, of which
+    the past tells nothing: F has a zero row (UT-CLAT eq. 33).
+    """
+    noise = delta_cov
+    if held is not None:
+        noise = delta_cov.copy()
+        noise[2, :] = noise[:, 2] = 0.0
+        noise[2, 2] = held.sigma_m**2
+    if transform == "jacobian":
+        pose = compose(mean[[0, 1, 3]], delta[[0, 1, 3]])
+        moved = np.array([pose[0], pose[1], mean[2] + delta[2], wrap(pose[2])])
+        F, G = np.eye(4), np.eye(4)
+        F[0, 3], F[1, 3] = mean[1] - moved[1], moved[0] - mean[0]
+        cos, sin = np.cos(mean[3]), np.sin(mean[3])
+        G[:2, :2] = [[cos, -sin], [sin, cos]]
+        if held is not None:
+            moved[2], F[2, 2] = held.altitude_m, 0.0
+        return Propagated(moved, F @ cov @ F.T + G @ noise @ G.T, F)
+    active = np.flatnonzero(np.diagonal(noise) > 0.0)
+    root = np.zeros((4, len(active)))
+    if len(active):
+        root[active] = square_root(noise[np.ix_(active, active)])
+
+    def move(points: Array, noises: Array) -> Array:
+        steps = delta + noises
+        image = np.empty(steps.shape)
+        image[..., [0, 1, 3]] = compose(points[..., [0, 1, 3]], steps[..., [0, 1, 3]])
+        image[..., 2] = points[..., 2] + steps[..., 2] if held is None else held.altitude_m + noises[..., 2]
+        return image
+
+    return propagate(move, mean, cov, root, SPATIAL.angles, parameters)
+
+
+@dataclass(frozen=True, slots=True)
 class RobotMotion:
-    """How a robot's own state moves with its odometry."""
+    """How a robot's own state moves with its odometry; here x, y, heading."""
 
     layout: StateLayout = UNICYCLE
 
@@ -126,23 +210,46 @@ PLANAR_MOTION = RobotMotion()
 
 
 @dataclass(frozen=True, slots=True)
+class SpatialMotion(RobotMotion):
+    """Motion of x, y, z, heading; the altitude is that of the odometry, or `held`."""
+
+    layout: StateLayout = SPATIAL
+    held: HeldAltitude | None = None
+
+    def advance(
+        self,
+        mean: Array,
+        cov: Array,
+        delta: Array,
+        delta_cov: Array,
+        dt_s: float,
+        transform: Transform,
+        parameters: UnscentedParameters = DEFAULT,
+    ) -> Propagated:
+        return advance_spatial(mean, cov, delta, delta_cov, transform, parameters, self.held)
+
+
+@dataclass(frozen=True, slots=True)
 class TargetMotion:
     """How an uncooperative target moves, as its trackers model it.
 
-    unicycle            control (speed_mps, yaw_rate_radps) with white noise on both;
-    constant_velocity   white acceleration noise;
-    damped_velocity     the same with velocity decaying by exp(-dt / damping_s).
+    unicycle                control (speed_mps, yaw_rate_radps) with white noise on both;
+    spatial                 the same at a held altitude;
+    constant_velocity[_3d]  white acceleration noise on each axis;
+    damped_velocity[_3d]    the same with velocity decaying by exp(-dt / damping_s);
+    constant_acceleration   white jerk noise on each axis.
 
-    Noise is given as standard deviation of a control held over `noise_step_s`; a step of another length dt
+    Noise is given as standard deviation of a control (of an axis) held over `noise_step_s`; a step of another length dt
     keeps the same spectral density: variance sigma^2 noise_step_s / dt of a control held over dt.
     """
 
     layout: StateLayout
     control: tuple[float, float] = (0.0, 0.0)
-    noise_sigma: tuple[float, float] = (0.1, 0.1)
+    noise_sigma: tuple[float, ...] = (0.1, 0.1)
     noise_step_s: float = 1.0
     damping_s: float = 2.0
     parameters: UnscentedParameters = field(default=DEFAULT)
+    held: HeldAltitude | None = None
 
     def drift(self, mean: Array, cov: Array, dt_s: float, transform: Transform) -> Propagated:
         """Belief (n,), (n, n) after `dt_s` > 0 seconds."""
@@ -152,33 +259,49 @@ class TargetMotion:
         speed, turn = self.control[0] * dt_s, self.control[1] * dt_s
         delta = np.array([speed, 0.0, 0.0, turn])
         noise = np.diag([(self.noise_sigma[0] * scale) ** 2, 0.0, 0.0, (self.noise_sigma[1] * scale) ** 2])
+        if self.layout is SPATIAL:
+            return advance_spatial(mean, cov, delta, noise, transform, self.parameters, self.held)
         return advance(mean, cov, delta, noise, transform, self.parameters)
 
     def _drift_velocity(self, mean: Array, cov: Array, dt: float) -> Propagated:
         F, Q = velocity_step(self.layout, dt, self.damping_s)
         density = np.array(self.noise_sigma) ** 2 * self.noise_step_s
-        Q = Q * np.tile(density, 2)[:, None]
+        Q = Q * np.tile(density, self.layout.dim // len(density))[:, None]
         return Propagated(F @ mean, F @ cov @ F.T + Q, F)
 
 
 def velocity_step(layout: StateLayout, dt: float, damping_s: float) -> tuple[Array, Array]:
-    """(F, Q) of a planar velocity model over `dt` for unit acceleration density; Q exact (van Loan)."""
-    F, Q = np.eye(4), np.zeros((4, 4))
-    if layout is CONSTANT_VELOCITY:
-        position, velocity = dt, 1.0
-        q_pp, q_pv, q_vv = dt**3 / 3.0, dt**2 / 2.0, dt
+    """(F, Q) (n, n) over `dt` of a model without heading, for unit density of the noise that drives it; Q is exact.
+
+    The noise drives the highest derivative in the state: acceleration noise a velocity, jerk noise an acceleration.
+    """
+    axes = np.eye(len(layout.position))
+    if layout in (DAMPED_VELOCITY, DAMPED_VELOCITY_3D):
+        F, Q = _damped_axis(dt, 1.0 / damping_s)
     else:
-        rate = 1.0 / damping_s
-        decay = -math.expm1(-rate * dt)
-        position, velocity = decay / rate, 1.0 - decay
-        q_vv = -math.expm1(-2.0 * rate * dt) / (2.0 * rate)
-        q_pv = decay**2 / (2.0 * rate**2)
-        q_pp = dt**3 * _damped_position_variance(rate * dt)
-    for axis in (0, 1):
-        F[axis, axis + 2], F[axis + 2, axis + 2] = position, velocity
-        Q[axis, axis], Q[axis + 2, axis + 2] = q_pp, q_vv
-        Q[axis, axis + 2] = Q[axis + 2, axis] = q_pv
+        F, Q = _integrated_axis(dt, layout.dim // len(axes))
+    return np.asarray(np.kron(F, axes), dtype=np.float64), np.asarray(np.kron(Q, axes), dtype=np.float64)
+
+
+def _integrated_axis(dt: float, order: int) -> tuple[Array, Array]:
+    """(F, Q) of a chain of `order` integrators driven by white noise (van Loan)."""
+    F, Q = np.eye(order), np.empty((order, order))
+    for i in range(order):
+        for j in range(order):
+            if j > i:
+                F[i, j] = dt ** (j - i) / math.factorial(j - i)
+            p, q = order - 1 - i, order - 1 - j
+            Q[i, j] = dt ** (p + q + 1) / ((p + q + 1) * math.factorial(p) * math.factorial(q))
     return F, Q
+
+
+def _damped_axis(dt: float, rate: float) -> tuple[Array, Array]:
+    """(F, Q) of position and a velocity that decays at `rate` (van Loan)."""
+    decay = -math.expm1(-rate * dt)
+    q_vv = -math.expm1(-2.0 * rate * dt) / (2.0 * rate)
+    q_pv = decay**2 / (2.0 * rate**2)
+    q_pp = dt**3 * _damped_position_variance(rate * dt)
+    return np.array([[1.0, decay / rate], [0.0, 1.0 - decay]]), np.array([[q_pp, q_pv], [q_pv, q_vv]])
 
 
 def _damped_position_variance(x: float) -> float:

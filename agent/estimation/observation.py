@@ -1,135 +1,373 @@
 """Observation models: absolute information and relative measurements of a peer, a target or a landmark.
 
-A relative model maps the observer's pose (x, y, heading, ...) and the position of what it sees to a
-measurement; both are read from one stacked vector so that a transform can be drawn over their joint.
+A relative model maps the observer's pose and the position of what it sees to a measurement; both are read from one
+stacked vector so that a transform can be drawn over their joint. It is worked out in the plane if all positions are
+planar, and in space if one of them has an altitude or the measurement is spatial itself (`bearing3`, `pixel`): what is
+planar then lies at z = 0 of the fleet's frame.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian import wrap
-from agent.estimation.motion import StateLayout
+from agent.estimation.motion import UNICYCLE, StateLayout
+from agent.events import LEVEL, Observation
+from network.messages import NO_MOUNT, Measurement, Mount
 
 Array = NDArray[np.float64]
 
-RELATIVE_ANGLES: dict[str, tuple[int, ...]] = {"range": (), "bearing": (0,), "range_bearing": (1,), "vector": ()}
-"""Kinds of relative measurement and their wrapped components."""
+RELATIVE_ANGLES: dict[str, tuple[int, ...]] = {
+    "range": (),
+    "bearing": (0,),
+    "bearing3": (0,),
+    "range_bearing": (1,),
+    "vector": (),
+    "pixel": (),
+}
+"""Kinds of relative measurement and their wrapped components (an elevation never passes the half turn)."""
+
+SPATIAL_KINDS = ("bearing3", "pixel")
 
 ABSOLUTE: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
     "position": ((0, 1), ()),
     "pose": ((0, 1, 2), (2,)),
     "heading": ((2,), (0,)),
 }
-"""Kinds of absolute information: (observed state components, wrapped measurement components)."""
+"""Kinds of absolute information of a planar pose: (observed state components, wrapped measurement components)."""
 
-NO_MOUNT = (0.0, 0.0, 0.0)
+MIN_DISTANCE_M = 1e-3
+MIN_DEPTH_M = 0.1
+"""A camera sees nothing that is nearer to its image plane, or behind it."""
+
+
+class OutOfViewError(np.linalg.LinAlgError):
+    """A pixel was to be predicted of a point that is not, or not surely, in front of the camera."""
+
+
+def planar_mount(x: float, y: float, yaw: float) -> Mount:
+    """A sensor that is turned about the vertical only."""
+    return (x, y, 0.0, 0.0, 0.0, yaw)
+
+
+def mount_of(values: list[float]) -> Mount:
+    """A mount stated as x, y, yaw or as x, y, z, roll, pitch, yaw."""
+    if len(values) == 3:
+        return planar_mount(values[0], values[1], values[2])
+    x, y, z, roll, pitch, yaw = values
+    return (x, y, z, roll, pitch, yaw)
+
+
+def rotation(roll: float, pitch: float, yaw: float) -> Array:
+    """(3, 3) Rz(yaw) Ry(pitch) Rx(roll): from the turned FLU axes to those they were turned from.
+
+    A positive roll lowers the right side, a positive pitch the nose.
+    """
+    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def levelled(mount: Mount, attitude: tuple[float, float]) -> Mount:
+    """The mount (x, y, z, roll, pitch, yaw) on a level body that is equal to `mount` on one with roll and pitch."""
+    if attitude == LEVEL:
+        return mount
+    tilt = rotation(*attitude, 0.0)
+    turn = tilt @ rotation(*mount[3:])
+    x, y, z = (tilt @ np.array(mount[:3])).tolist()
+    level = math.hypot(turn[0, 0], turn[1, 0])
+    pitch = math.atan2(-turn[2, 0], level)
+    if level > 1e-6:
+        return (x, y, z, math.atan2(turn[2, 1], turn[2, 2]), pitch, math.atan2(turn[1, 0], turn[0, 0]))
+    # Straight down or up, roll and yaw are one angle.
+    return (x, y, z, 0.0, pitch, math.atan2(-turn[0, 1], turn[1, 1]))
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """A pinhole camera: focal length, principal point and image size (width, height), all in pixels."""
+
+    focal_px: float = 500.0
+    center_px: tuple[float, float] = (320.0, 240.0)
+    size_px: tuple[float, float] = (640.0, 480.0)
+
+    def normalized(self, z: Array, R: Array) -> tuple[Array, Array]:
+        """A pixel (2,) with covariance (2, 2) on the image plane at unit distance from the principal point."""
+        return (z - np.array(self.center_px)) / self.focal_px, R / self.focal_px**2
+
+    def shows(self, pixel: Array) -> bool:
+        """Whether a pixel (2,) lies in the image."""
+        return bool(np.all(pixel >= 0.0) and np.all(pixel <= np.array(self.size_px)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AbsoluteModel:
-    """z = selected components of a state of `layout`."""
+    """z = selected components of a state of `layout`.
+
+    `position` is x, y or, with `size` 3, x, y, z; `pose` is x, y, heading or, with `size` 4, x, y, z, heading.
+    """
 
     kind: str
     layout: StateLayout
+    size: int = 0
+    components: tuple[int, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        found = absolute_components(self.kind, self.layout, self.size)
+        if found is None:
+            raise ValueError(f"kind '{self.kind}' of {self.size} numbers says nothing of a state '{self.layout.name}'")
+        object.__setattr__(self, "components", tuple(state for _, state in found))
 
     @property
     def angles(self) -> tuple[int, ...]:
-        return ABSOLUTE[self.kind][1]
+        return tuple(row for row, column in enumerate(self.components) if column == self.layout.heading)
 
     def h(self, state: Array) -> Array:
-        return np.asarray(state[..., list(ABSOLUTE[self.kind][0])])
+        return np.asarray(state[..., list(self.components)])
 
     def jacobian(self, state: Array) -> Array:
-        components = ABSOLUTE[self.kind][0]
-        H = np.zeros((*state.shape[:-1], len(components), self.layout.dim))
-        for row, column in enumerate(components):
+        H = np.zeros((*state.shape[:-1], len(self.components), self.layout.dim))
+        for row, column in enumerate(self.components):
             H[..., row, column] = 1.0
         return H
 
 
+def absolute_components(kind: str, layout: StateLayout, size: int = 0) -> list[tuple[int, int]] | None:
+    """Pairs (component of z, component of the state) of absolute information; None if it says nothing of the state.
+
+    An altitude in a position is left out for a planar state.
+    """
+    place = [(row, column) for row, column in enumerate(layout.position)]
+    heading = [] if layout.heading is None else [layout.heading]
+    match kind, size:
+        case ("position", 0 | 2):
+            return place[:2]
+        case ("position", 3):
+            return place
+        case ("pose", 0 | 3):
+            return [*place[:2], *((2, column) for column in heading)]
+        case ("pose", 4):
+            return [*place, *((3, column) for column in heading)]
+        case ("heading", 0 | 1) if heading:
+            return [(0, heading[0])]
+        case ("altitude", 0 | 1) if layout.altitude is not None:
+            return [(0, layout.altitude)]
+    return None
+
+
+def absolute_model(kind: str, layout: StateLayout, z: Array, R: Array) -> tuple[AbsoluteModel, Array, Array] | None:
+    """The model of absolute information z (m,), R (m, m), with what of it the state has; None if that is nothing."""
+    found = absolute_components(kind, layout, len(z))
+    if found is None:
+        return None
+    rows = [row for row, _ in found]
+    model = AbsoluteModel(kind, layout, len(z))
+    return (model, z, R) if len(rows) == len(z) else (model, z[rows], R[np.ix_(rows, rows)])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativeModel:
-    """Range [m], bearing [rad] or both from an observer to a subject, or the `vector` x, y [m] in the sensor's frame.
+    """What an observer's sensor measures of a subject.
 
-    The stacked state is [observer; subject], the subject's position being its first two components, or
-    `landmark` (2,) when given (the stack is then the observer alone). `mount` is the sensor's lever arm x, y
-    [m, FLU] and yaw [rad] on the observer's body. The observer needs a heading unless the kind is `range` and
-    the lever arm is zero.
+    range           distance [m]
+    bearing         azimuth [rad] about the sensor's upward axis, left positive, from its forward axis
+    bearing3        azimuth and elevation [rad]
+    range_bearing   distance and azimuth
+    vector          x, y [m] in the sensor's frame (forward, left)
+    pixel           u (right), v (down) of a pinhole whose optical axis is the sensor's forward axis, on the image plane
+                    at unit distance, or in pixels with `intrinsics` (UT-CLAT eq. 36: d_f x_c[:2] / x_c[2])
+
+    The stacked state is [observer; subject], or the observer alone with a `landmark` (2,) or (3,). `mount` is the
+    sensor's lever arm x, y, z [m, FLU] and turn roll, pitch, yaw [rad] on the observer's body, `attitude` the body's
+    roll and pitch at the instant. The observer needs a heading unless the kind is `range` and the lever arm is zero.
     """
 
     kind: str
     observer: StateLayout
-    mount: tuple[float, float, float] = NO_MOUNT
-    landmark: tuple[float, float] | None = None
+    mount: Mount = NO_MOUNT
+    landmark: tuple[float, ...] | None = None
+    subject: StateLayout = UNICYCLE
+    attitude: tuple[float, float] = LEVEL
+    intrinsics: Intrinsics | None = None
+    dims: int = field(init=False)
+    _turn: Array = field(init=False)
+    _lever: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        seen = len(self.subject.position) if self.landmark is None else len(self.landmark)
+        dims = 3 if self.kind in SPATIAL_KINDS else max(seen, len(self.observer.position))
+        mount = self.mount
+        if dims == 2:
+            cos, sin = math.cos(mount[5]), math.sin(mount[5])
+            turn = np.array([[cos, sin], [-sin, cos]])
+        else:
+            turn = rotation(*mount[3:]).T
+        lever = turn @ np.array(mount[:dims])
+        if dims == 3 and self.attitude != LEVEL:
+            turn = turn @ rotation(*self.attitude, 0.0).T
+        for name, value in (("dims", dims), ("_turn", turn), ("_lever", lever)):
+            object.__setattr__(self, name, value)
 
     @property
     def angles(self) -> tuple[int, ...]:
         return RELATIVE_ANGLES[self.kind]
 
-    def _geometry(self, state: Array) -> tuple[Array, Array]:
-        """Vector (..., 2) from sensor to subject in ENU, and the vector (..., 2) of the lever arm in ENU."""
-        subject: Array
-        if self.landmark is not None:
-            subject = np.asarray(self.landmark)
-        else:
-            subject = state[..., self.observer.dim : self.observer.dim + 2]
-        x, y, _ = self.mount
-        if x == 0.0 and y == 0.0:
-            lever = np.zeros((*state.shape[:-1], 2))
-        else:
-            cos, sin = np.cos(state[..., 2]), np.sin(state[..., 2])
-            lever = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-        return subject - state[..., :2] - lever, lever
+    @property
+    def _turns(self) -> bool:
+        """Whether the measurement depends on where the observer heads."""
+        return self.kind != "range" or bool(np.any(self._lever))
 
-    def _turn(self, state: Array) -> Array:
-        """Rotation (..., 2, 2) from ENU into the sensor's frame."""
-        angle = state[..., 2] + self.mount[2]
-        cos, sin = np.cos(angle), np.sin(angle)
-        return np.stack([np.stack([cos, sin], axis=-1), np.stack([-sin, cos], axis=-1)], axis=-2)
+    def _between(self, state: Array) -> Array:
+        """Vector (..., dims) from observer to subject in ENU."""
+        own = len(self.observer.position)
+        d = np.zeros((*state.shape[:-1], self.dims))
+        if self.landmark is not None:
+            d[..., : len(self.landmark)] = self.landmark
+        else:
+            begin, size = self.observer.dim, len(self.subject.position)
+            d[..., :size] = state[..., begin : begin + size]
+        d[..., :own] -= state[..., :own]
+        return d
+
+    def _levelled(self, state: Array, d: Array) -> Array:
+        """A vector (..., dims) in ENU, in the levelled body's frame."""
+        if self.observer.heading is None:
+            raise ValueError(f"a '{self.kind}' of an observer without heading: '{self.observer.name}'")
+        heading = state[..., self.observer.heading]
+        cos, sin = np.cos(heading), np.sin(heading)
+        turned = d.copy()
+        turned[..., 0] = cos * d[..., 0] + sin * d[..., 1]
+        turned[..., 1] = cos * d[..., 1] - sin * d[..., 0]
+        return turned
+
+    def _in_sensor(self, levelled: Array) -> Array:
+        """Where a sensor sees what lies (..., dims) from its robot in the levelled body's frame."""
+        return np.asarray(levelled @ self._turn.T - self._lever)
 
     def h(self, state: Array) -> Array:
-        """Measurement (..., m) of a stacked state (..., n)."""
-        d, _ = self._geometry(state)
-        if self.kind == "vector":
-            return np.asarray((self._turn(state) @ d[..., None])[..., 0])
-        distance = np.hypot(d[..., 0], d[..., 1])
-        if self.kind == "range":
-            return np.asarray(distance[..., None])
-        bearing = wrap(np.arctan2(d[..., 1], d[..., 0]) - state[..., 2] - self.mount[2])
-        if self.kind == "bearing":
-            return np.asarray(bearing[..., None])
-        return np.stack([distance, bearing], axis=-1)
+        """Measurement (..., m) of a stacked state (..., n). Raises `OutOfViewError`."""
+        s = self._between(state)
+        if self._turns:
+            s = self._in_sensor(self._levelled(state, s))
+        match self.kind:
+            case "range":
+                return _norm(s)[..., None]
+            case "bearing":
+                return _azimuth(s)[..., None]
+            case "bearing3":
+                return np.stack([_azimuth(s), np.arctan2(s[..., 2], np.hypot(s[..., 0], s[..., 1]))], axis=-1)
+            case "range_bearing":
+                return np.stack([_norm(s), _azimuth(s)], axis=-1)
+            case "vector":
+                return np.asarray(s[..., :2])
+        _in_front(s)
+        plane = -s[..., 1:] / s[..., :1]
+        if self.intrinsics is None:
+            return np.asarray(plane)
+        return np.asarray(self.intrinsics.focal_px * plane + np.array(self.intrinsics.center_px))
 
     def jacobian(self, state: Array) -> Array:
-        """H (..., m, n). Distances below 1 mm are taken as 1 mm: the bearing is undefined at the sensor."""
-        d, lever = self._geometry(state)
-        n = state.shape[-1]
-        if self.kind == "vector":
-            turn = self._turn(state)
-            H = np.zeros((*state.shape[:-1], 2, n))
-            H[..., :2] = -turn
-            if self.landmark is None:
-                H[..., self.observer.dim : self.observer.dim + 2] = turn
-            seen = (turn @ (d + lever)[..., None])[..., 0]
-            H[..., 0, 2], H[..., 1, 2] = seen[..., 1], -seen[..., 0]
-            return H
-        distance = np.maximum(np.hypot(d[..., 0], d[..., 1]), 1e-3)
-        unit = d / distance[..., None]
-        normal = np.stack([-unit[..., 1], unit[..., 0]], axis=-1) / distance[..., None]
-        turned = np.stack([-lever[..., 1], lever[..., 0]], axis=-1)
-        rows = []
-        for direction, is_bearing in ((unit, False), (normal, True)):
-            if self.kind != "range_bearing" and is_bearing != (self.kind == "bearing"):
-                continue
-            row = np.zeros((*state.shape[:-1], n))
-            row[..., :2] = -direction
-            if self.landmark is None:
-                row[..., self.observer.dim : self.observer.dim + 2] = direction
-            if is_bearing or np.any(lever):
-                row[..., 2] = -np.sum(direction * turned, axis=-1) - (1.0 if is_bearing else 0.0)
-            rows.append(row)
-        return np.stack(rows, axis=-2)
+        """H (..., m, n). Distances below 1 mm are taken as 1 mm: angles are undefined at the sensor.
+
+        Raises `OutOfViewError`.
+        """
+        d = self._between(state)
+        dims, own = self.dims, len(self.observer.position)
+        J = np.zeros((*state.shape[:-1], dims, state.shape[-1]))
+        turn = np.zeros((*state.shape[:-1], dims, dims))
+        if self._turns:
+            levelled = self._levelled(state, d)
+            heading = state[..., self.observer.heading]
+            cos, sin = np.cos(heading), np.sin(heading)
+            turn[..., 0, 0], turn[..., 0, 1], turn[..., 1, 0], turn[..., 1, 1] = cos, sin, -sin, cos
+            if dims == 3:
+                turn[..., 2, 2] = 1.0
+            turn = self._turn @ turn
+            across = np.zeros_like(levelled)
+            across[..., 0], across[..., 1] = levelled[..., 1], -levelled[..., 0]
+            J[..., self.observer.heading] = across @ self._turn.T
+            s = self._in_sensor(levelled)
+        else:
+            turn[...] = np.eye(dims)
+            s = d
+        J[..., :own] = -turn[..., :own]
+        if self.landmark is None:
+            begin, size = self.observer.dim, len(self.subject.position)
+            J[..., begin : begin + size] = turn[..., :size]
+        return np.asarray(self._gradient(s) @ J)
+
+    def _gradient(self, s: Array) -> Array:
+        """Derivative (..., m, dims) of the measurement by the subject's place (..., dims) in the sensor's frame."""
+        rows = np.zeros((*s.shape[:-1], len(MEASURED[self.kind]), self.dims))
+        for index, what in enumerate(MEASURED[self.kind]):
+            row = rows[..., index, :]
+            level = np.maximum(np.hypot(s[..., 0], s[..., 1]), MIN_DISTANCE_M)
+            match what:
+                case "range":
+                    row[...] = s / np.maximum(_norm(s), MIN_DISTANCE_M)[..., None]
+                case "azimuth":
+                    row[..., 0], row[..., 1] = -s[..., 1] / level**2, s[..., 0] / level**2
+                case "elevation":
+                    square = np.maximum(_norm(s), MIN_DISTANCE_M) ** 2
+                    row[..., :2] = -(s[..., 2] / (level * square))[..., None] * s[..., :2]
+                    row[..., 2] = level / square
+                case "x" | "y":
+                    row[..., index] = 1.0
+                case _:
+                    _in_front(s)
+                    focal = 1.0 if self.intrinsics is None else self.intrinsics.focal_px
+                    row[..., 0] = focal * s[..., index + 1] / s[..., 0] ** 2
+                    row[..., index + 1] = -focal / s[..., 0]
+        return rows
+
+
+MEASURED: dict[str, tuple[str, ...]] = {
+    "range": ("range",),
+    "bearing": ("azimuth",),
+    "bearing3": ("azimuth", "elevation"),
+    "range_bearing": ("range", "azimuth"),
+    "vector": ("x", "y"),
+    "pixel": ("u", "v"),
+}
+"""What the numbers of a relative measurement are."""
+
+
+def _norm(vector: Array) -> Array:
+    if vector.shape[-1] == 2:
+        return np.asarray(np.hypot(vector[..., 0], vector[..., 1]))
+    return np.asarray(np.sqrt(np.sum(vector**2, axis=-1)))
+
+
+def _azimuth(vector: Array) -> Array:
+    return wrap(np.arctan2(vector[..., 1], vector[..., 0]))
+
+
+def _in_front(vector: Array) -> None:
+    if not np.all(vector[..., 0] >= MIN_DEPTH_M):
+        raise OutOfViewError("a point of the belief is behind the image plane")
+
+
+def relative_model(
+    measured: Observation | Measurement,
+    observer: StateLayout,
+    subject: StateLayout = UNICYCLE,
+    landmark: tuple[float, ...] | None = None,
+) -> RelativeModel:
+    """The model of a measurement by a robot of state `observer`, of a state `subject` or of a `landmark`."""
+    attitude = measured.attitude if isinstance(measured, Observation) else LEVEL
+    return RelativeModel(measured.kind, observer, measured.mount, landmark, subject, attitude)
+
+
+def told(observation: Observation) -> Measurement:
+    """An observation as it is told to a peer: as if by a sensor on a level body."""
+    mount = levelled(observation.mount, observation.attitude)
+    return Measurement(observation.kind, observation.z, observation.R, mount)
