@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: run test check unit setup clean
+.PHONY: run test check unit setup check-data clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("cofix needs Python 3.11 or newer: make PYTHON=python3.11") if sys.version_info < (3, 11) else None'
@@ -24,9 +24,15 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/mypy --strict examples
+	$(BIN)/mypy benchmarks
 
 unit: setup
 	$(BIN)/python -P -m pytest tests
+
+# make check-data UTIAS7=FOLDER [TIERS=FOLDER]: the tests on recorded data, which is not part of the repository.
+check-data: setup
+	@test -n "$(UTIAS7)$(TIERS)" || { echo "check-data: give UTIAS7=FOLDER of MRCLAM_Dataset7, or TIERS=FOLDER of the UWB bags"; exit 2; }
+	COFIX_UTIAS7="$(UTIAS7)" COFIX_TIERS="$(TIERS)" $(BIN)/python -P -m pytest tests/sim/test_utias.py tests/sim/test_utias_acceptance.py tests/sim/test_tiers.py
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
