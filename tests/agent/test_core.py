@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from agent.core import Agent
 from agent.effects import Send
-from agent.estimation.motion import split_increment
+from agent.estimation.motion import LAYOUTS, TargetMotion, split_increment
 from agent.events import Event, Fix, Observation, Odometry, Tick
 from agent.recording import pack
-from agent.settings import NS, AgentSettings, LatenessSettings, LocalizationSettings
+from agent.settings import NS, AgentSettings, LatenessSettings, LocalizationSettings, TargetSettings
 from network.messages import PairRequest
 
 Array = NDArray[np.float64]
@@ -239,3 +239,44 @@ def test_no_order_of_stamps_stalls_the_core(
         reached = subject.filter.state.t_ns
         assert subject.next_deadline_ns() >= subject.now_ns
         np.linalg.cholesky(subject.filter.state.cov)
+
+
+# --- sightings of targets that come late -------------------------------------------------------------------------
+
+
+def tracker() -> Agent:
+    layout = LAYOUTS["constant_velocity"]
+    motion = TargetMotion(layout, noise_sigma=(0.3, 0.3))
+    target = TargetSettings("t1", motion, np.array([5.0, 3.0, 0.1, 0.0]), np.eye(4))
+    return Agent(replace(agent().settings, cov=np.diag([0.3, 0.2, 1e-12]), targets=(target,)))
+
+
+def sighted(t_ns: int, now_ns: int) -> Observation:
+    return Observation(now_ns, t_ns, "vector", "target:t1", np.array([4.4, -0.6]), 0.02 * np.eye(2))
+
+
+def straight(k: int) -> Odometry:
+    still = np.diag([0.02, 0.01, 0.0, 0.0])
+    return Odometry((k + 1) * NS, k * NS, (k + 1) * NS, np.array([0.3, 0.1, 0.0, 0.0]), still)
+
+
+def test_a_late_sighting_of_a_target_equals_the_timely_one_when_linear() -> None:
+    drives = [straight(k) for k in range(3)]
+    timely = fed(tracker(), drives[0], sighted(NS, NS), *drives[1:])
+    late = fed(tracker(), *drives, sighted(NS, 3 * NS))
+    assert late.counters["late.target_compensated"] == 1
+    assert_same_belief(timely, late, 1e-9)
+    for one, other in zip(timely.estimate().tracks, late.estimate().tracks):
+        np.testing.assert_allclose(one.mean, other.mean, atol=1e-9)
+        np.testing.assert_allclose(one.cov, other.cov, atol=1e-9)
+
+
+def test_a_sighting_from_before_the_last_one_is_not_used_twice() -> None:
+    drives = [straight(k) for k in range(3)]
+    seen = fed(tracker(), *drives, sighted(3 * NS, 3 * NS))
+    before = seen.estimate().tracks[0].cov
+    fed(seen, sighted(2 * NS, 3 * NS))
+    assert seen.counters["late.target_dropped"] == 1
+    np.testing.assert_array_equal(seen.estimate().tracks[0].cov, before)
+    twice = fed(tracker(), *drives, sighted(NS, 3 * NS), sighted(2 * NS, 3 * NS))
+    assert twice.counters["late.target_dropped"] == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from agent.config_file import ConfigError
 from agent.timeline import Phase
 from sim.recorded_world import RecordedWorld
 from sim.scenario import Scenario, check
+from sim.summary import reduce, summarize
 from sim.trial import open_world, run_trial
 from sim.world import Output, order
 
@@ -151,5 +153,103 @@ def test_a_recording_is_played_like_any_world_and_repeats(folder: Path) -> None:
 def test_a_robot_the_recording_lacks_is_named(folder: Path) -> None:
     with pytest.raises(ConfigError, match="no data of robot r5; there are: r1, r2, r3"):
         open_world(scenario(folder, ("r1", "r5")), 1)
-    with pytest.raises(ConfigError, match="no ground truth of robot r3"):
-        open_world(scenario(folder, ("r1", "r3")), 1)
+
+
+def changed(made: Scenario, **change: Any) -> Scenario:
+    found = Scenario.model_validate(made.model_dump(exclude_none=True) | change)
+    check(found)
+    return found
+
+
+def test_a_command_acts_later_by_the_lag(folder: Path) -> None:
+    """r1's command changes in the middle of a second; the motion does so 0.25 s after it."""
+    (folder / "Robot1_Odometry.dat").write_text(f"{T0 + 1}.000 0.2 0.0\n{T0 + 15}.500 0.6 0.0\n{T0 + 39}.000 0.6 0.0\n")
+    made = scenario(folder)
+    robots = made.model_dump(exclude_none=True)["robots"]
+    robots[0]["odometry"] |= {"scale_along": 1.0, "lag_s": 0.25}
+    world = RecordedWorld(changed(made, robots=robots), 1)
+    moved = {
+        item.t_ns // S + start_of(world): float(item.z[0])
+        for item in everything(world)
+        if item.kind == "odometry" and item.robot == "r1"
+    }
+    assert (moved[15], moved[16], moved[17]) == pytest.approx((0.2, 0.2 + 0.4 * 0.25, 0.6))
+
+
+def silent(folder: Path, **more: Any) -> Scenario:
+    """r1 alone, r2 as a target."""
+    made = scenario(folder, ("r1",))
+    robots = made.model_dump(exclude_none=True)["robots"]
+    robots[0]["sensors"]["eye"] = CAMERA | {"of": ["targets"], "form": "vector", "lag_s": 0.1} | more
+    target = {
+        "id": "r2",
+        "recorded": True,
+        "model": "damped_velocity",
+        "start_sigma": {"position_m": 0.1, "velocity_mps": 0.1},
+        "noise": {"acceleration_mps2": 0.1},
+    }
+    return changed(made, robots=robots, targets=[target], tracking={"kind": "clat"})
+
+
+def test_a_robot_that_sends_nothing_is_a_target(folder: Path) -> None:
+    world = RecordedWorld(silent(folder), 1)
+    assert (world.robots, world.targets) == (("r1",), ("r2",))
+    np.testing.assert_allclose(world.truth("r2", 3), [2.0, 1.0, 0.0, 0.0])
+    mean, cov = world.start_belief("r2")
+    assert (mean.shape, cov.shape) == ((4,), (4, 4))
+    seen = [(item.sensor, item.of, item.phase) for item in everything(world) if item.of]
+    assert seen == [("eye", "target:r2", Phase.TARGET), ("camera", "landmark:L6", Phase.PRIVATE)]
+    result = run_trial(silent(folder), 1, with_bound=True)
+    assert result.nis["r1"]["target_vector"][1] == 1
+    assert result.trace.bound is not None
+    for track in (result.trace.targets["r2"]["r1"], result.trace.bound["targets"]["r2"]):
+        assert np.all(np.isfinite(track.mean))
+
+
+def test_a_moving_target_has_its_velocity(folder: Path) -> None:
+    made = silent(folder)
+    data = made.model_dump(exclude_none=True)
+    data["robots"][0]["id"], data["targets"][0]["id"] = "r2", "r1"
+    world = RecordedWorld(Scenario.model_validate(data), 1)
+    np.testing.assert_allclose(world.truth("r1", 4)[2:], [0.2, 0.0], atol=1e-9)
+
+
+def test_a_sensor_reaches_so_far_and_no_further(folder: Path) -> None:
+    far = [item.of for item in everything(RecordedWorld(silent(folder, max_range_m=1.1), 1)) if item.of]
+    near = [item.of for item in everything(RecordedWorld(silent(folder, max_range_m=1.3), 1)) if item.of]
+    assert "target:r2" not in far
+    assert "target:r2" in near
+
+
+def test_without_truth_a_recording_plays_from_a_start_that_is_said(folder: Path) -> None:
+    robots = scenario(folder, ("r1", "r3")).model_dump(exclude_none=True)["robots"]
+    with pytest.raises(ConfigError, match=r"say where it starts, --set 'robots\.r3\.start\.pose="):
+        RecordedWorld(scenario(folder, ("r1", "r3")), 1)
+    robots[1]["start"] = {"pose": [1.0, 2.0, 0.5]}
+    made = changed(scenario(folder, ("r1", "r3")), robots=robots)
+    world = RecordedWorld(made, 1)
+    assert list(world.start_belief("r3")[0]) == [1.0, 2.0, 0.5]
+    assert np.isnan(world.truth("r3", 0)).all()
+    result = run_trial(made, 1, with_bound=True)
+    summary = summarize(made, "virtual", 1, [reduce(made, result)], simulated_s=30.0, timing={})
+    assert summary["lost"] == 0
+    assert summary["robots"]["r3"]["position_rmse_m"] is None
+    assert summary["robots"]["r1"]["position_rmse_m"] is not None
+    assert summary["robots"]["r1"]["nis"]["pair_range_bearing"] > 0.0
+    json.dumps(summary, allow_nan=False)
+    robots[1]["sensors"]["position"] = {"sigma_m": 1.0}
+    with pytest.raises(ConfigError, match="no ground truth of robot r3 to make fixes of"):
+        RecordedWorld(changed(made, robots=robots), 1)
+
+
+def test_gains_of_the_odometry_have_no_truth_and_no_figures(folder: Path) -> None:
+    robots = scenario(folder).model_dump(exclude_none=True)["robots"]
+    for robot in robots:
+        robot |= {"model": "unicycle_gains"}
+        robot["start_sigma"] |= {"gain_along": 0.1, "gain_turn": 0.1}
+    made = changed(scenario(folder), robots=robots)
+    mean, cov = RecordedWorld(made, 1).start_belief("r1")
+    assert list(mean[3:]) == [1.0, 1.0]
+    assert cov[4, 4] == pytest.approx(0.01)
+    trace = run_trial(made, 1, with_bound=True).trace
+    assert trace.robots["r1"].mean.shape == trace.robots["r1"].truth.shape == (trace.t_s.size, 3)
