@@ -142,11 +142,13 @@ def decode(payload: bytes, now_ns: int, sensors: dict[str, SensorConfig]) -> Eve
     z = _array(data.get("z"), SIZES[kind])
     size = len(z)
     R = _matrix(data.get("R"), size)
+    of = data.get("of")
+    about_itself = kind == "odometry" or kind in ABSOLUTE_KINDS
+    if about_itself and "attitude" in data:
+        raise SensorError("malformed")
     roll, pitch = _array(data["attitude"], (2,)).tolist() if "attitude" in data else LEVEL
     if max(abs(roll), abs(pitch)) >= MAX_TILT:
         raise SensorError("out_of_range")
-    of = data.get("of")
-    about_itself = kind == "odometry" or kind in ABSOLUTE_KINDS
     if of is not None and (about_itself or type(of) is not str or not _SUBJECT.match(of)):
         raise SensorError("bad_subject")
     if not np.array_equal(R, R.T):

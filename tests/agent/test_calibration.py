@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agent.calibration import NO_CALIBRATION, Calibration, corrected, formed
+from agent.estimation.observation import planar_mount
 from agent.events import Observation, Odometry
 from agent.sensor_input import SensorConfig, decode, encode
 
@@ -73,11 +74,11 @@ def test_the_vectors_noise_is_along_and_across_the_sight(distance: float, bearin
 
 
 def test_a_datagram_is_used_as_its_sensor_is_known() -> None:
-    camera = SensorConfig((0.1, 0.0, 0.0), Calibration(bias_m=0.5), 30_000_000, "vector")
+    camera = SensorConfig(planar_mount(0.1, 0.0, 0.0), Calibration(bias_m=0.5), 30_000_000, "vector")
     payload = encode(1_000_000_000, "range_bearing", np.array([2.5, 0.0]), np.diag([0.01, 0.01]), of="r2", sensor="eye")
     event = decode(payload, 1_100_000_000, {"eye": camera})
     assert isinstance(event, Observation)
-    assert (event.kind, event.t_meas_ns, event.mount) == ("vector", 970_000_000, (0.1, 0.0, 0.0))
+    assert (event.kind, event.t_meas_ns, event.mount) == ("vector", 970_000_000, planar_mount(0.1, 0.0, 0.0))
     np.testing.assert_allclose(event.z, [2.0, 0.0])
 
 

@@ -13,6 +13,7 @@ import tomli_w
 from agent.config import AgentConfig, load_agent_config
 from agent.config_file import ConfigError, validate
 from agent.config_parts import LocalizationPart, OdometryPart, SigmaPart
+from agent.estimation.observation import planar_mount
 
 
 def example(**change: Any) -> dict[str, Any]:
@@ -72,7 +73,7 @@ def test_a_file_becomes_what_the_core_is_given(tmp_path: Path) -> None:
     (target,) = settings.targets
     np.testing.assert_allclose(target.cov, np.diag([1.0, 1.0, 0.25, 0.25]))
     assert target.motion.noise_sigma == (0.2, 0.2)
-    assert config.sensor_configs()["uwb"].mount == (0.1, 0.0, 0.0)
+    assert config.sensor_configs()["uwb"].mount == planar_mount(0.1, 0.0, 0.0)
 
 
 def test_without_tracking_no_target_is_tracked() -> None:

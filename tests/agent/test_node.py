@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from agent.effects import Effect
 from agent.estimation.gaussian import is_positive_definite
+from agent.estimation.observation import Intrinsics, planar_mount
 from agent.events import Event, LinkChange, Observation, Odometry, Tick
 from agent.node import Node, Outgoing, rejected
 from agent.sensor_input import ABSOLUTE_KINDS, SIZES, SensorConfig, encode
@@ -32,7 +33,10 @@ def node(robot: str, seen: list[tuple[Event, list[Effect]]] | None = None) -> No
         boot_id=7,
         incarnation=1,
         software="test",
-        sensors={"uwb": SensorConfig((0.1, 0.0, 0.0))},
+        sensors={
+            "uwb": SensorConfig(planar_mount(0.1, 0.0, 0.0)),
+            "camera": SensorConfig((0.0, 0.0, 1.0, 0.0, 0.3, 0.0), intrinsics=Intrinsics()),
+        },
         recorder=recorder,
     )
 
@@ -102,7 +106,7 @@ def test_the_core_sees_events_that_passed_and_the_recorder_sees_what_it_saw() ->
     assert [type(event) for event, _ in seen] == [Odometry, Observation, Tick]
     observation = seen[1][0]
     assert isinstance(observation, Observation)
-    assert observation.mount == (0.1, 0.0, 0.0)
+    assert observation.mount == planar_mount(0.1, 0.0, 0.0)
     assert all(isinstance(effects, list) for _, effects in seen)
 
 
@@ -188,7 +192,7 @@ NUMBERS = st.floats(-100.0, 100.0) | st.floats(-1e9, 1e9)
 def well_formed(draw: st.DrawFn) -> bytes:
     """A datagram that passes the sensor gate, with numbers from sensible to absurd."""
     kind = draw(st.sampled_from(["range", *SIZES]))
-    size = SIZES[kind]
+    size = draw(st.sampled_from(SIZES[kind]))
     t_ns = draw(st.integers(1, 20 * S))
     data: dict[str, Any] = {
         "t_ns": t_ns,
@@ -202,6 +206,9 @@ def well_formed(draw: st.DrawFn) -> bytes:
         data["t0_ns"] = max(0, t_ns - draw(st.integers(1, 3 * S)))
     elif kind not in ABSOLUTE_KINDS:
         data["of"] = draw(st.sampled_from(["r2", "r2", None, "r1", "r3", "landmark:x", "target:x"]))
+        data["sensor"] = draw(st.sampled_from(["", "camera"]))
+        if draw(st.booleans()):
+            data["attitude"] = draw(st.lists(st.floats(-1.5, 1.5), min_size=2, max_size=2))
     return bytes(msgpack.packb(data))
 
 

@@ -273,7 +273,8 @@ SNAPSHOT = Snapshot(
     (TargetBelief("t1", BELIEF),),
     False,
 )
-REQUEST = PairRequest(Epoch(9, "r2", 3), (Measurement("range", np.array([4.2]), np.eye(1), (0.1, 0.2, 0.3)),), SNAPSHOT)
+RANGE = Measurement("range", np.array([4.2]), np.eye(1), (0.1, 0.2, 0.0, 0.0, 0.0, 0.3))
+REQUEST = PairRequest(Epoch(9, "r2", 3), (RANGE,), SNAPSHOT)
 HEADER = Header("r2", 2**60, 3, 17, 5, 6)
 VALUES: list[Any] = [
     Tick(2**62),

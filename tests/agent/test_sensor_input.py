@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.estimation.observation import RELATIVE_ANGLES
-from agent.events import Fix, Observation, Odometry
+from agent.estimation.observation import RELATIVE_ANGLES, Intrinsics, planar_mount
+from agent.events import LEVEL, Fix, Observation, Odometry
 from agent.sensor_input import (
     ABSOLUTE_KINDS,
     MAX_DATAGRAM_BYTES,
@@ -21,14 +21,18 @@ from agent.sensor_input import (
     decode,
     encode,
 )
+from network.messages import NO_MOUNT
 
 NOW = 5_000_000_000
-SENSORS = {"uwb": SensorConfig((0.3, -0.1, 1.5))}
+SENSORS = {
+    "uwb": SensorConfig(planar_mount(0.3, -0.1, 1.5)),
+    "camera": SensorConfig((0.1, 0.0, -0.05, 0.0, 1.57, 0.0), intrinsics=Intrinsics(400.0, (300.0, 200.0))),
+}
 
 
 def measurement(kind: str, **change: Any) -> dict[str, Any]:
     """A valid datagram of a kind as a plain map, with changes."""
-    size = SIZES[kind]
+    size = SIZES[kind][0]
     data: dict[str, Any] = {
         "t_ns": 1_000,
         "kind": kind,
@@ -38,6 +42,8 @@ def measurement(kind: str, **change: Any) -> dict[str, Any]:
     }
     if kind == "odometry":
         data["t0_ns"] = 500
+    if kind == "pixel":
+        data["sensor"] = "camera"
     return data | change
 
 
@@ -54,9 +60,8 @@ def reason_of(kind: str = "range", **change: Any) -> str:
 # --- what may be said -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", SIZES)
-def test_every_kind_arrives_as_it_was_sent(kind: str) -> None:
-    size = SIZES[kind]
+@pytest.mark.parametrize(("kind", "size"), [(kind, size) for kind in SIZES if kind != "pixel" for size in SIZES[kind]])
+def test_every_kind_arrives_as_it_was_sent(kind: str, size: int) -> None:
     z = np.linspace(0.1, 0.7, size)
     root = np.tril(np.linspace(0.1, 1.0, size * size).reshape(size, size))
     R = root @ root.T
@@ -64,7 +69,8 @@ def test_every_kind_arrives_as_it_was_sent(kind: str) -> None:
     relative = kind in RELATIVE_ANGLES
     of = "landmark:L-3.b" if relative else None
     t0_ns = 600 if kind == "odometry" else None
-    event = decode(encode(1_000, kind, z, R, of=of, sensor="uwb", t0_ns=t0_ns), NOW, SENSORS)
+    attitude = (0.1, -0.2) if relative else None
+    event = decode(encode(1_000, kind, z, R, of=of, sensor="uwb", t0_ns=t0_ns, attitude=attitude), NOW, SENSORS)
     assert event.t_ns == NOW
     if isinstance(event, Odometry):
         assert (kind, event.t0_ns, event.t_meas_ns) == ("odometry", 600, 1_000)
@@ -74,16 +80,53 @@ def test_every_kind_arrives_as_it_was_sent(kind: str) -> None:
         assert (event.kind, event.t_meas_ns, event.sensor) == (kind, 1_000, "uwb")
         got, noise = event.z, event.R
     if isinstance(event, Observation):
-        assert (event.of, event.mount) == (of, (0.3, -0.1, 1.5))
+        assert (event.of, event.mount, event.attitude) == (of, planar_mount(0.3, -0.1, 1.5), attitude)
     np.testing.assert_array_equal(got, z)
     np.testing.assert_array_equal(noise, R)
+
+
+def test_a_pixel_is_taken_to_the_image_plane_at_unit_distance() -> None:
+    payload = encode(1_000, "pixel", np.array([340.0, 180.0]), np.diag([4.0, 16.0]), of="target:t1", sensor="camera")
+    event = decode(payload, NOW, SENSORS)
+    assert isinstance(event, Observation)
+    assert np.allclose(event.z, [0.1, -0.05])
+    assert np.allclose(event.R, np.diag([4.0, 16.0]) / 400.0**2)
+    assert (event.mount, event.attitude) == (SENSORS["camera"].mount, LEVEL)
+
+
+@pytest.mark.parametrize("sensor", ["", "uwb", "nobody"])
+def test_a_pixel_of_a_sensor_that_is_no_camera_means_nothing(sensor: str) -> None:
+    assert reason_of("pixel", sensor=sensor) == "no_intrinsics"
+
+
+@pytest.mark.parametrize(
+    ("attitude", "why"),
+    [
+        ([], "wrong_length"),
+        ([0.1], "wrong_length"),
+        ([0.1, 0.2, 0.3], "wrong_length"),
+        (None, "wrong_length"),
+        ([True, 0.1], "wrong_type"),
+        ([0.1, "0"], "wrong_type"),
+        ([float("nan"), 0.0], "out_of_range"),
+        ([0.0, 1.6], "out_of_range"),
+        ([-1.6, 0.0], "out_of_range"),
+    ],
+)
+def test_an_attitude_is_a_roll_and_a_pitch_below_a_quarter_turn(attitude: Any, why: str) -> None:
+    assert reason_of(attitude=attitude) == why
+
+
+@pytest.mark.parametrize("kind", [*ABSOLUTE_KINDS, "odometry"])
+def test_what_speaks_of_the_robot_itself_has_no_attitude(kind: str) -> None:
+    assert reason_of(kind, attitude=[0.0, 0.0]) == "malformed"
     assert got.dtype == noise.dtype == np.float64
 
 
 def test_a_sensor_nobody_configured_sits_at_the_body_centre() -> None:
     event = decode(encode(1, "range", np.array([2.0]), np.eye(1), of="r2", sensor="other"), NOW, SENSORS)
     assert isinstance(event, Observation)
-    assert event.mount == (0.0, 0.0, 0.0)
+    assert event.mount == NO_MOUNT
 
 
 @pytest.mark.parametrize("of", ["r2", "robot-24-characters-long", "landmark:L3", "target:t1", None])
@@ -169,14 +212,14 @@ def test_odometry_needs_its_start() -> None:
 
 @pytest.mark.parametrize("kind", SIZES)
 def test_lengths_follow_from_the_kind(kind: str) -> None:
-    size = SIZES[kind]
+    size = SIZES[kind][-1]
     good = measurement(kind)
     assert reason_of(kind, z=[]) == "wrong_length"
     assert reason_of(kind, z=[0.1] * (size + 1)) == "wrong_length"
     assert reason_of(kind, z=0.1) == "wrong_length"
     assert reason_of(kind, R=good["R"][:-1]) == "wrong_length"
-    assert reason_of(kind, R=[[0.1] * (size + 1)] * size) == "wrong_length"
-    assert reason_of(kind, R=[0.1] * size) == "wrong_length"
+    assert reason_of(kind, R=[[0.1] * (size + 1)] * SIZES[kind][0]) == "wrong_length"
+    assert reason_of(kind, R=[0.1] * SIZES[kind][0]) == "wrong_length"
     assert reason_of(kind, R={"0": 1}) == "wrong_length"
 
 
@@ -197,9 +240,9 @@ def test_a_bearing_may_be_negative_but_a_distance_may_not() -> None:
     assert reason_of("range_bearing", z=[-1.0, 1.0]) == "out_of_range"
 
 
-@pytest.mark.parametrize("kind", [kind for kind in SIZES if SIZES[kind] > 1])
+@pytest.mark.parametrize("kind", [kind for kind in SIZES if SIZES[kind][0] > 1])
 def test_a_covariance_is_symmetric_and_positive(kind: str) -> None:
-    size = SIZES[kind]
+    size = SIZES[kind][0]
     asymmetric = np.eye(size)
     asymmetric[0, 1] = 0.5
     indefinite = np.eye(size)
@@ -213,7 +256,7 @@ def test_a_covariance_is_symmetric_and_positive(kind: str) -> None:
 @pytest.mark.parametrize("kind", [kind for kind in SIZES if kind != "odometry"])
 @pytest.mark.parametrize("variance", [0.0, 1e-13, -1.0])
 def test_no_sensor_is_exact(kind: str, variance: float) -> None:
-    R = np.eye(SIZES[kind])
+    R = np.eye(SIZES[kind][0])
     R[0, 0] = variance
     assert reason_of(kind, R=R.tolist()) == "not_positive_definite"
 
@@ -261,7 +304,7 @@ def test_a_damaged_datagram_is_refused_by_name_or_still_makes_sense(kind: str, d
 
 @given(
     st.sampled_from(sorted(SIZES)),
-    st.dictionaries(st.sampled_from(["t_ns", "t0_ns", "kind", "of", "z", "R", "sensor"]), NESTED, min_size=1),
+    st.dictionaries(st.sampled_from(["t_ns", "t0_ns", "kind", "of", "z", "R", "sensor", "attitude"]), NESTED, min_size=1),
 )
 def test_any_value_under_a_known_key_is_refused_by_name_or_makes_sense(kind: str, change: dict[str, Any]) -> None:
     survives(msgpack.packb(measurement(kind) | change))

@@ -66,13 +66,30 @@ def example_snapshot() -> Snapshot:
 
 def example_request() -> PairRequest:
     z, R = np.array([4.5, 0.5]), np.array([[0.04, 0.001], [0.001, 0.0025]])
-    measurement = Measurement("range_bearing", z, R, mount=(0.1, 0.0, 1.5))
+    measurement = Measurement("range_bearing", z, R, mount=(0.1, 0.0, 0.0, 0.0, 0.0, 1.5))
     return PairRequest(Epoch(1_000, "r1", 9), (measurement,), example_snapshot())
+
+
+def example_spatial_request() -> PairRequest:
+    """A quadrotor that sees another one in its camera, and tracks something that flies."""
+    pixel = Measurement("pixel", np.array([0.25, -0.125]), np.eye(2) / 16384, (0.1, 0.0, -0.05, 0.25, 1.5, 0.0))
+    snapshot = Snapshot(
+        belief=Belief("spatial", np.array([1.5, -2.0, 16.5, 0.25]), np.diag([0.25, 0.5, 0.125, 0.01])),
+        base=NEVER,
+        factor=np.zeros((4, 0)),
+        line=np.eye(4),
+        targets=(
+            TargetBelief("t1", Belief("damped_velocity_3d", np.arange(6.0), np.eye(6) * 2)),
+            TargetBelief("t2", Belief("constant_acceleration", np.arange(6.0), np.eye(6) / 2)),
+        ),
+    )
+    return PairRequest(Epoch(1_000, "r1", 10), (pixel,), snapshot)
 
 
 EXAMPLES: dict[str, Body] = {
     "hello": Hello("0.1.0", (ClockEcho("r2", 10, 20), ClockEcho("r3", 30, 40))),
     "pair_request": example_request(),
+    "pair_request_spatial": example_spatial_request(),
     "pair_reply": PairReply(Epoch(1_000, "r2", 9), ReplyStatus.OK, example_snapshot()),
     "pair_reply_too_old": PairReply(Epoch(1_000, "r2", 9), ReplyStatus.TOO_OLD),
 }
@@ -125,7 +142,7 @@ def beliefs(draw: st.DrawFn) -> Belief:
 def measurements(draw: st.DrawFn) -> Measurement:
     kind = draw(st.sampled_from(sorted(MEASUREMENT_DIMS)))
     m = MEASUREMENT_DIMS[kind]
-    mount = draw(st.tuples(numbers, numbers, numbers))
+    mount = draw(st.tuples(numbers, numbers, numbers, numbers, numbers, numbers))
     return Measurement(kind, draw(arrays(m)), draw(covariances(m)), mount)
 
 

@@ -9,6 +9,7 @@ import pytest
 import tomli_w
 
 from agent.config import load_agent_config
+from agent.estimation.observation import planar_mount
 from sim.agents import agent_config, agent_tables, odometry_table, table
 from sim.scenario import Scenario, load
 from sim.trial import open_world
@@ -63,7 +64,7 @@ def test_parts_overridden_for_one_robot_reach_it_alone() -> None:
         "compensate",
     ]
     assert [config.settings(0).track for config in configs.values()] == [True, True, True, False]
-    assert configs["r2"].sensor_configs()["range"].mount == (0.1, 0.2, 0.3)
+    assert configs["r2"].sensor_configs()["range"].mount == planar_mount(0.1, 0.2, 0.3)
     assert configs["r3"].settings(0).one_way_sensors == ("range",)
     assert configs["r1"].sensors["target_range"].kind == "range"
 

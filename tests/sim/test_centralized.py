@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import PLANAR_MOTION, UNICYCLE, TargetMotion
-from agent.estimation.observation import RelativeModel
+from agent.estimation.observation import RelativeModel, planar_mount
 from agent.estimation.unscented import Transform
 from sim.centralized import CentralizedFilter
 
@@ -67,7 +67,7 @@ def test_it_is_the_joint_filter() -> None:
         robot = ("r1", "r2")[int(rng.integers(2))]
         of = ("r2" if robot == "r1" else "r1", "target:t1", "landmark:L1")[int(rng.integers(3))]
         kind = ("range", "bearing", "range_bearing")[int(rng.integers(3))]
-        mount = (0.2, -0.1, 0.5)
+        mount = planar_mount(0.2, -0.1, 0.5)
         landmark = LANDMARKS["L1"] if of.startswith("landmark") else None
         model = RelativeModel(kind, UNICYCLE, mount, landmark)
         rows = list(range(START[robot], START[robot] + 3))

@@ -26,6 +26,9 @@ class Line:
     def start_belief(self, entity: str) -> tuple[Array, Array]:
         return self.truth(entity, 0), np.eye(3)
 
+    def place(self, entity: str, k: int) -> Array:
+        return self.truth(entity, k)
+
     def truth(self, entity: str, k: int) -> Array:
         return np.array([{"r1": 0.0, "r2": self._places[k], "r3": 100.0}[entity], 0.0, 0.0])
 

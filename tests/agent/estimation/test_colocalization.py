@@ -23,7 +23,7 @@ from agent.estimation.colocalization import (
 from agent.estimation.gaussian import is_positive_definite, wrap
 from agent.estimation.intersection import Weight
 from agent.estimation.motion import UNICYCLE
-from agent.estimation.observation import AbsoluteModel, RelativeModel
+from agent.estimation.observation import AbsoluteModel, RelativeModel, planar_mount
 from agent.estimation.unscented import DEFAULT, Transform
 from network.messages import NEVER, Belief, Epoch, Line, Measurement, Snapshot
 from tests.assertions import assert_consistent
@@ -221,8 +221,8 @@ def snapshots(joint: Array) -> tuple[Snapshot, Snapshot]:
 
 
 BOTH = [
-    Measurement("range", np.array([5.6]), np.array([[0.01]]), (0.1, 0.2, 0.0)),
-    Measurement("bearing", np.array([0.15]), np.array([[0.002]]), (0.0, 0.1, 0.2)),
+    Measurement("range", np.array([5.6]), np.array([[0.01]]), planar_mount(0.1, 0.2, 0.0)),
+    Measurement("bearing", np.array([0.15]), np.array([[0.002]]), planar_mount(0.0, 0.1, 0.2)),
 ]
 
 
@@ -251,7 +251,7 @@ def test_a_contact_applied_by_both_is_the_joint_update(transform: Transform, ini
     pair = (low, high) if initiator_is_low else (high, low)
     order = np.arange(6) if initiator_is_low else np.array([3, 4, 5, 0, 1, 2])
     arranged = joint[np.ix_(order, order)]
-    found = contact(*pair, initiator_is_low, BOTH, UNICYCLE, True, options(transform))
+    found = contact(*pair, initiator_is_low, BOTH, True, options(transform))
     state = np.concatenate([pair[0].belief.mean, pair[1].belief.mean])
     model = StackedModel([RelativeModel(item.kind, UNICYCLE, item.mount) for item in BOTH], [1, 1])
     z, R = np.array([5.6, 0.15]), np.diag([0.01, 0.002])
@@ -275,7 +275,7 @@ TWO = type(UNICYCLE)("two robots", 6, (2, 5), 2)
 def test_a_contact_applied_late_is_the_contact_applied_in_time_and_moved() -> None:
     rng = np.random.default_rng(62)
     joint = random_joint(rng)
-    found = contact(*snapshots(joint), True, BOTH, UNICYCLE, True, options())
+    found = contact(*snapshots(joint), True, BOTH, True, options())
     F, Q = np.eye(3) + 0.1 * rng.normal(size=(3, 3)), random_covariance(rng, 3) * 0.01
     in_time = pair_update(LOW_MEAN, joint[:3, :3], UNICYCLE, np.eye(3), found.C_i, found)
     late = pair_update(F @ LOW_MEAN, F @ joint[:3, :3] @ F.T + Q, UNICYCLE, F, found.C_i, found)
@@ -287,18 +287,18 @@ def test_a_contact_applied_late_is_the_contact_applied_in_time_and_moved() -> No
 
 def test_a_contact_that_would_leave_no_covariance_is_refused() -> None:
     """A belief now that is better than what the old contact still had to give."""
-    found = contact(*snapshots(random_joint(np.random.default_rng(71))), True, BOTH, UNICYCLE, True, options())
+    found = contact(*snapshots(random_joint(np.random.default_rng(71))), True, BOTH, True, options())
     assert pair_update(LOW_MEAN, np.eye(3) * 1e-6, UNICYCLE, np.eye(3), found.C_i, found) is None
 
 
 def test_the_naive_contact_takes_the_pair_for_uncorrelated() -> None:
     joint = random_joint(np.random.default_rng(63))
-    found = contact(*snapshots(joint), True, BOTH, UNICYCLE, False, options("jacobian"))
+    found = contact(*snapshots(joint), True, BOTH, False, options("jacobian"))
     assert found.cross is not None
     assert not found.cross.any()
     blind = joint.copy()
     blind[:3, 3:] = blind[3:, :3] = 0.0
-    honest = contact(*snapshots(blind), True, BOTH, UNICYCLE, True, options("jacobian"))
+    honest = contact(*snapshots(blind), True, BOTH, True, options("jacobian"))
     assert np.allclose(found.S, honest.S)
     assert np.allclose(found.C_i, honest.C_i)
 
@@ -307,7 +307,7 @@ def test_an_inadmissible_correlation_is_clipped_before_it_is_used() -> None:
     joint = random_joint(np.random.default_rng(64))
     low, high = snapshots(joint)
     low = Snapshot(low.belief, NEW, joint[:3, 3:] * 20.0, np.eye(3))
-    found = contact(low, high, True, BOTH, UNICYCLE, True, options())
+    found = contact(low, high, True, BOTH, True, options())
     assert found.cross is not None
     repaired = joint.copy()
     repaired[:3, 3:], repaired[3:, :3] = found.cross, found.cross.T
@@ -320,15 +320,15 @@ def test_a_contact_of_unknown_correlation_says_so() -> None:
     forgotten = Snapshot(low.belief, NEW, low.factor, low.line, known=False)
     for initiator_is_low in (True, False):
         pair = (forgotten, high) if initiator_is_low else (high, forgotten)
-        assert contact(*pair, initiator_is_low, BOTH, UNICYCLE, True, options()).cross is None
+        assert contact(*pair, initiator_is_low, BOTH, True, options()).cross is None
 
 
 @pytest.mark.parametrize("cap", [1.0, 6.0])
 def test_the_cap_of_a_contact_is_met_exactly(cap: float) -> None:
     joint = random_joint(np.random.default_rng(66))
     outlier = [Measurement("range_bearing", np.array([30.0, 2.0]), np.diag([0.01, 0.01]))]
-    plain = contact(*snapshots(joint), True, outlier, UNICYCLE, True, options())
-    capped = contact(*snapshots(joint), True, outlier, UNICYCLE, True, options(cap=cap))
+    plain = contact(*snapshots(joint), True, outlier, True, options())
+    capped = contact(*snapshots(joint), True, outlier, True, options(cap=cap))
     assert plain.nis > cap
     assert capped.nis == pytest.approx(plain.nis)
     assert float(capped.innovation @ np.linalg.solve(capped.S, capped.innovation)) / 2.0 == pytest.approx(cap)
@@ -348,7 +348,7 @@ def test_pairs_stay_honest_when_their_correlation_is_kept() -> None:
             item = Measurement("range_bearing", model.h(truth) + rng.normal(size=2) * np.sqrt(np.diagonal(R)), R)
             low = Snapshot(Belief("unicycle", means[0], covs[0]), NEW, cross, np.eye(3))
             high = Snapshot(Belief("unicycle", means[1], covs[1]), NEW, np.eye(3), np.eye(3))
-            found = contact(low, high, True, [item], UNICYCLE, correlated, options())
+            found = contact(low, high, True, [item], correlated, options())
             for side, C in enumerate((found.C_i, found.C_j)):
                 update = pair_update(means[side], covs[side], UNICYCLE, np.eye(3), C, found)
                 assert update is not None
@@ -417,7 +417,7 @@ def test_the_correlation_is_that_of_the_errors_whoever_applied_the_last_contact(
     """A contact, then both move: P_ab from the snapshots is the joint filter's with the other's gain set to zero."""
     rng = np.random.default_rng(68)
     joint = random_joint(rng)
-    found = contact(*snapshots(joint), True, BOTH, UNICYCLE, True, options("jacobian"))
+    found = contact(*snapshots(joint), True, BOTH, True, options("jacobian"))
     F_low, F_high = np.eye(3) + 0.2 * rng.normal(size=(3, 3)), np.eye(3) + 0.2 * rng.normal(size=(3, 3))
     epoch = Epoch(4, "r1", 2)
     low = (
@@ -454,10 +454,10 @@ def test_measurements_of_one_instant_are_as_good_together_as_in_turn() -> None:
     joint = random_joint(np.random.default_rng(70), 1e-7)
     exact = np.concatenate([LOW_MEAN, HIGH_MEAN])
     items = [Measurement(i.kind, RelativeModel(i.kind, UNICYCLE, i.mount).h(exact), i.R * 1e-5, i.mount) for i in BOTH]
-    together = contact(*snapshots(joint), True, items, UNICYCLE, True, options("jacobian"))
+    together = contact(*snapshots(joint), True, items, True, options("jacobian"))
     both = pair_update(LOW_MEAN, joint[:3, :3], UNICYCLE, np.eye(3), together.C_i, together)
     for item in items:
-        found = contact(*snapshots(joint), True, [item], UNICYCLE, True, options("jacobian"))
+        found = contact(*snapshots(joint), True, [item], True, options("jacobian"))
         after = joint.copy()
         for side, C in enumerate((found.C_i, found.C_j)):
             part = slice(3 * side, 3 * side + 3)

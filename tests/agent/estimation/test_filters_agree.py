@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from agent.estimation.colocalization import Options, absolute_update
 from agent.estimation.motion import UNICYCLE, compose
-from agent.estimation.observation import AbsoluteModel, RelativeModel
+from agent.estimation.observation import AbsoluteModel, RelativeModel, planar_mount
 from agent.estimation.unscented import DEFAULT, Transform, observe, propagate
 
 Array = NDArray[np.float64]
@@ -91,7 +91,7 @@ def test_batches_equal_single_calls() -> None:
     means = rng.normal(size=(5, 3))
     roots = rng.normal(size=(5, 3, 3))
     covs = roots @ roots.swapaxes(-1, -2) * 0.05 + 0.01 * np.eye(3)
-    model = RelativeModel("range_bearing", UNICYCLE, mount=(0.2, -0.1, 0.4), landmark=(4.0, 9.0))
+    model = RelativeModel("range_bearing", UNICYCLE, mount=planar_mount(0.2, -0.1, 0.4), landmark=(4.0, 9.0))
     for transform in TRANSFORMS:
         batch = observe(model.h, model.jacobian, means, covs, model.angles, transform)
         for k in range(5):
