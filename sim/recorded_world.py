@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.calibration import Calibration, corrected
 from agent.config_file import ConfigError
 from agent.estimation.gaussian import wrap_components
 from agent.estimation.motion import LAYOUTS
@@ -59,6 +60,11 @@ class RecordedWorld:
         span = min(round(scenario.duration_s * NS), self._recording.end_ns - self._start_ns)
         self.steps = int(span // self.step_ns)
         self._noise: dict[tuple[str, str], Array] = {}
+        self._calibrations = {
+            (robot.id, name): sensor.calibration.settings()
+            for robot in scenario.robots
+            for name, sensor in robot.sensors.items()
+        }
 
     def _check(self, path: str) -> None:
         """Raises `ConfigError` for what the recording does not hold."""
@@ -167,7 +173,7 @@ class RecordedWorld:
                 # A two-way range is measured by both; the lower id uses its own.
                 if what == "peers" and kind == "range" and sensor.two_way and of < robot.id:
                     continue
-                z, R = self._measured(kind, sensor, range_m, bearing_rad)
+                z, R = self._measured(kind, of, sensor, self._calibrations[robot.id, name], range_m, bearing_rad)
                 t_ns = int(sightings.t_ns[index]) - self._start_ns
                 outputs.append(Output(t_ns, phase_of(of), robot.id, name, kind, of, z, R))
         return outputs
@@ -178,15 +184,20 @@ class RecordedWorld:
             return "targets", f"target:{subject}"
         if subject in self._recording.robots:
             return "peers", subject if subject in self.robots else None
-        return "landmarks", f"landmark:{subject}"
+        return "landmarks", f"landmark:{subject}" if subject in self.landmarks else None
 
     @staticmethod
-    def _measured(kind: str, sensor: SensorPart, range_m: float, bearing_rad: float) -> tuple[Array, Array]:
+    def _measured(
+        kind: str, of: str, sensor: SensorPart, calibration: Calibration, range_m: float, bearing_rad: float
+    ) -> tuple[Array, Array]:
+        """The reading as recorded, with the covariance its sensor states at the calibrated distance."""
         full = {"range": [range_m], "bearing": [bearing_rad], "range_bearing": [range_m, bearing_rad]}
         z = np.array(full[kind])
         if not np.all(np.isfinite(z)):
             raise ConfigError(f"the recording does not hold what a sensor of kind '{kind}' measures; take another kind")
-        return z, relative_noise(kind, sensor, range_m)
+        polar = "range" if np.isnan(bearing_rad) else "range_bearing"
+        distance = corrected(polar, of, np.array(full[polar]), calibration)[0]
+        return z, relative_noise(kind, sensor, float(distance))
 
     def _fixes(self, robot: RobotPart, k: int) -> list[Output]:
         outputs = []

@@ -73,6 +73,7 @@ class WorldPart(Part):
     kind: Literal["simulated", "recording"] = "simulated"
     format: Literal["utias", "tiers"] = "utias"
     path: str | None = None
+    robots: list[Id] | None = None
     placement: PlacementPart | None = None
 
 
@@ -250,6 +251,13 @@ def load(name: str, overrides: list[str] | None = None) -> Scenario:
     for override in overrides or []:
         apply_override(data, override)
     scenario = validate(Scenario, data, str(path))
+    if (only := scenario.world.robots) is not None:
+        ids = [robot.id for robot in scenario.robots]
+        stranger = next((name for name in only if name not in ids), None)
+        if stranger is not None or not only:
+            there = ", ".join(ids)
+            raise ConfigError(f"{scenario.name}: world.robots: no robot '{stranger or ''}'; there are: {there}")
+        scenario = scenario.model_copy(update={"robots": [robot for robot in scenario.robots if robot.id in only]})
     check(scenario)
     return scenario
 

@@ -253,3 +253,17 @@ def test_gains_of_the_odometry_have_no_truth_and_no_figures(folder: Path) -> Non
     assert cov[4, 4] == pytest.approx(0.01)
     trace = run_trial(made, 1, with_bound=True).trace
     assert trace.robots["r1"].mean.shape == trace.robots["r1"].truth.shape == (trace.t_s.size, 3)
+
+
+def test_the_stated_deviation_is_that_of_the_calibrated_distance(folder: Path) -> None:
+    robots = scenario(folder).model_dump(exclude_none=True)["robots"]
+    robots[0]["sensors"]["camera"] |= {"calibration": {"depth": True, "bias_m": 0.2}}
+    item = next(i for i in everything(RecordedWorld(changed(scenario(folder), robots=robots), 1)) if i.of == "r2")
+    assert list(item.z) == [1.2, 0.9]
+    assert item.R[0, 0] == pytest.approx((0.1 + 0.1 * 1.0 / np.cos(0.9)) ** 2)
+
+
+def test_a_robot_that_is_not_in_the_recording_is_not_seen(folder: Path) -> None:
+    (folder / "Robot3_Odometry.dat").unlink()
+    seen = [item.of for item in everything(RecordedWorld(scenario(folder), 1)) if item.of]
+    assert seen == ["r2", "r1", "landmark:L6"]

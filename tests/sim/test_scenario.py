@@ -32,7 +32,7 @@ def robot(scenario: Scenario, name: str) -> Any:
 
 @pytest.mark.parametrize("name", bundled())
 def test_every_bundled_scenario_loads(name: str) -> None:
-    scenario = load(name, ["world.path=/somewhere"] if name.startswith("utias") else [])
+    scenario = load(name, ["world.path=/somewhere"] if name.startswith(("utias", "tiers")) else [])
     assert scenario.name == name
     assert scenario.window_s[1] <= scenario.duration_s
 
@@ -159,7 +159,7 @@ def test_a_mistake_is_answered_with_the_key_and_the_remedy(override: str, words:
 
 def test_an_unknown_scenario_is_answered_with_the_nearest_name() -> None:
     assert "did you mean 'ut-clat'?" in complaint(name="ut_clat")
-    assert "bundled: demo, ut-clat" in complaint(name="zzz")
+    assert "bundled: demo, tiers-uwb, ut-clat" in complaint(name="zzz")
 
 
 def test_a_recording_needs_its_path_and_has_no_more_than_it_holds() -> None:
@@ -207,3 +207,10 @@ def test_the_normative_example_states_what_the_defaults_are() -> None:
     for key in ("kind", "form", "transform", "correlation", "pair_timeout_s"):
         assert data["localization"][key] == getattr(localization, key)
     assert math.isclose(data["robots"][0]["start_sigma"]["heading_rad"], math.radians(2.0), rel_tol=1e-6)
+
+
+def test_a_part_of_the_robots_may_take_part() -> None:
+    few = load("ut-clat", ["world.robots=['r1', 'r3']"])
+    assert [robot.id for robot in few.robots] == ["r1", "r3"]
+    assert "no robot 'r9'; there are: r1, r2" in complaint("world.robots=['r1', 'r9']")
+    assert "no robot ''" in complaint("world.robots=[]")
