@@ -35,7 +35,10 @@ def save_trace(
     landmarks: dict[str, tuple[float, ...]],
     measured: Instants | None = None,
 ) -> None:
-    """Write `trace.npz`, of landmarks x and y. Instants are kept to the microsecond as gaps, which are nearly all alike and so pack well."""
+    """Write `trace.npz`, of landmarks x and y.
+
+    Instants are kept to the microsecond as gaps, which are nearly all alike and so pack well.
+    """
     arrays: dict[str, Any] = {"t_s": trace.t_s}
     index: list[dict[str, Any]] = []
 
