@@ -83,6 +83,7 @@ def test_every_kind_arrives_as_it_was_sent(kind: str, size: int) -> None:
         assert (event.of, event.mount, event.attitude) == (of, planar_mount(0.3, -0.1, 1.5), attitude)
     np.testing.assert_array_equal(got, z)
     np.testing.assert_array_equal(noise, R)
+    assert got.dtype == noise.dtype == np.float64
 
 
 def test_a_pixel_is_taken_to_the_image_plane_at_unit_distance() -> None:

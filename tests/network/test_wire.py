@@ -374,7 +374,7 @@ def test_target_named_twice_is_refused() -> None:
 def test_a_scalar_variance_obeys_the_floor_too() -> None:
     message = raw("pair_request")
     for variance, reason in [(0.0, "not_positive_definite"), (9e-11, "below_sensor_floor")]:
-        message[2][1] = [["range", 1, doubles(4.0), doubles(variance), doubles(0, 0, 0)]]
+        message[2][1] = [["range", 1, doubles(4.0), doubles(variance), doubles(0, 0, 0, 0, 0, 0)]]
         with pytest.raises(WireError, match=reason):
             decode(msgpack.packb(message), "r1")
 
