@@ -439,7 +439,7 @@ def test_the_correlation_is_that_of_the_errors_whoever_applied_the_last_contact(
 def test_stacked_models_are_the_models_one_above_the_other() -> None:
     rng = np.random.default_rng(69)
     kinds = ("bearing", "range_bearing", "range", "bearing")
-    models = [RelativeModel(kind, UNICYCLE, (0.1 * k, -0.1, 0.2 * k)) for k, kind in enumerate(kinds)]
+    models = [RelativeModel(kind, UNICYCLE, (0.1 * k, -0.1, 0.0, 0.0, 0.0, 0.2 * k)) for k, kind in enumerate(kinds)]
     stacked = StackedModel(models, [1, 2, 1, 1])
     assert stacked.angles == (0, 2, 4)
     states = rng.normal(size=(5, 6)) * 3.0
