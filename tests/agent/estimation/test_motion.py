@@ -227,4 +227,9 @@ def test_layouts_are_known_by_their_names() -> None:
         "unicycle_gains": (5, (2,), 2),
         "constant_velocity": (4, (), None),
         "damped_velocity": (4, (), None),
+        "constant_velocity_3d": (6, (), None),
+        "damped_velocity_3d": (6, (), None),
+        "constant_acceleration": (6, (), None),
+        "quadrotor": (4, (3,), 3),
+        "planar_altitude": (4, (3,), 3),
     }

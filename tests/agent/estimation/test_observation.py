@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from agent.estimation.gaussian import wrap, wrap_components
 from agent.estimation.motion import CONSTANT_VELOCITY, UNICYCLE, StateLayout
-from agent.estimation.observation import ABSOLUTE, RELATIVE_ANGLES, AbsoluteModel, RelativeModel
+from agent.estimation.observation import ABSOLUTE, RELATIVE_ANGLES, AbsoluteModel, RelativeModel, planar_mount
 
 Array = NDArray[np.float64]
 
@@ -46,9 +46,9 @@ def test_the_jacobian_of_a_relative_measurement_is_the_finite_difference(
     rest: int,
 ) -> None:
     """Of a peer or target with `rest` more components, which it doesn't depend on."""
-    model = RelativeModel(kind, UNICYCLE, mount)
+    model = RelativeModel(kind, UNICYCLE, planar_mount(*mount))
     state = np.concatenate([[x, y, heading, east, north], np.full(rest, 0.7)])
-    assume(float(RelativeModel("range", UNICYCLE, mount).h(state)[0]) > 0.5)
+    assume(float(RelativeModel("range", UNICYCLE, planar_mount(*mount)).h(state)[0]) > 0.5)
     found = model.jacobian(state)
     assert found.shape == (len(model.h(state)), 5 + rest)
     assert np.allclose(found, central_difference(model, state), atol=1e-6)
@@ -60,8 +60,8 @@ def test_a_landmark_is_a_subject_without_columns(
     kind: str, mount: tuple[float, float, float], x: float, y: float, heading: float, east: float, north: float
 ) -> None:
     observer, stacked = np.array([x, y, heading]), np.array([x, y, heading, east, north])
-    fixed, free = RelativeModel(kind, UNICYCLE, mount, (east, north)), RelativeModel(kind, UNICYCLE, mount)
-    assume(float(RelativeModel("range", UNICYCLE, mount).h(stacked)[0]) > 0.5)
+    fixed, free = RelativeModel(kind, UNICYCLE, planar_mount(*mount), (east, north)), RelativeModel(kind, UNICYCLE, planar_mount(*mount))
+    assume(float(RelativeModel("range", UNICYCLE, planar_mount(*mount)).h(stacked)[0]) > 0.5)
     assert np.array_equal(fixed.h(observer), free.h(stacked))
     assert np.array_equal(fixed.jacobian(observer), free.jacobian(stacked)[:, :3])
     assert np.allclose(fixed.jacobian(observer), central_difference(fixed, observer), atol=1e-6)
@@ -79,7 +79,7 @@ def test_what_is_seen_does_not_depend_on_the_frame(
     shift_y: float,
     turn: float,
 ) -> None:
-    model = RelativeModel("range_bearing", UNICYCLE, mount)
+    model = RelativeModel("range_bearing", UNICYCLE, planar_mount(*mount))
     here = np.array([x, y, heading, east, north])
     cos, sin = math.cos(turn), math.sin(turn)
     rotation, shift = np.array([[cos, -sin], [sin, cos]]), np.array([shift_x, shift_y])
@@ -110,15 +110,15 @@ def test_known_ranges_and_bearings(
     state: list[float], mount: tuple[float, float, float], distance: float, bearing: float
 ) -> None:
     at = np.array(state)
-    assert np.allclose(RelativeModel("range_bearing", UNICYCLE, mount).h(at), [distance, bearing])
-    assert np.allclose(RelativeModel("range", UNICYCLE, mount).h(at), [distance])
-    assert np.allclose(RelativeModel("bearing", UNICYCLE, mount).h(at), [bearing])
+    assert np.allclose(RelativeModel("range_bearing", UNICYCLE, planar_mount(*mount)).h(at), [distance, bearing])
+    assert np.allclose(RelativeModel("range", UNICYCLE, planar_mount(*mount)).h(at), [distance])
+    assert np.allclose(RelativeModel("bearing", UNICYCLE, planar_mount(*mount)).h(at), [bearing])
 
 
 def test_bearings_are_wrapped_whatever_the_heading() -> None:
     headings = np.linspace(-9.0, 9.0, 181)
     states = np.column_stack([np.zeros((181, 2)), headings, np.full(181, -4.0), np.full(181, 0.5)])
-    bearings = RelativeModel("bearing", UNICYCLE, (0.0, 0.0, 2.5)).h(states)
+    bearings = RelativeModel("bearing", UNICYCLE, planar_mount(0.0, 0.0, 2.5)).h(states)
     assert bearings.shape == (181, 1)
     assert np.all(bearings > -math.pi)
     assert np.all(bearings <= math.pi)
@@ -127,7 +127,7 @@ def test_bearings_are_wrapped_whatever_the_heading() -> None:
 
 @pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (0.3, 0.1)])
 def test_a_range_depends_on_the_heading_through_the_lever_arm_alone(x: float, y: float) -> None:
-    jacobian = RelativeModel("range", UNICYCLE, (x, y, 0.0)).jacobian(np.array([0.0, 0.0, 0.4, 5.0, 7.0]))
+    jacobian = RelativeModel("range", UNICYCLE, planar_mount(x, y, 0.0)).jacobian(np.array([0.0, 0.0, 0.4, 5.0, 7.0]))
     assert bool(jacobian[0, 2]) == bool(x or y)
 
 
@@ -150,7 +150,7 @@ def test_derivatives_of_many_states_are_those_of_each() -> None:
     states = rng.normal(size=(3, 2, 6)) * 4.0
     for kind in RELATIVE_ANGLES:
         for landmark in (None, (20.0, 3.0)):
-            model = RelativeModel(kind, UNICYCLE, (0.3, -0.2, 0.5), landmark)
+            model = RelativeModel(kind, UNICYCLE, planar_mount(0.3, -0.2, 0.5), landmark)
             at = states if landmark is None else states[..., :3]
             batch = model.jacobian(at)
             for index in np.ndindex(3, 2):
@@ -175,6 +175,6 @@ def test_a_vector_is_range_and_bearing_in_cartesian_form(
     mount: tuple[float, float, float], x: float, y: float, heading: float, east: float, north: float
 ) -> None:
     state = np.array([x, y, heading, east, north])
-    distance, bearing = RelativeModel("range_bearing", UNICYCLE, mount).h(state)
-    vector = RelativeModel("vector", UNICYCLE, mount).h(state)
+    distance, bearing = RelativeModel("range_bearing", UNICYCLE, planar_mount(*mount)).h(state)
+    vector = RelativeModel("vector", UNICYCLE, planar_mount(*mount)).h(state)
     assert np.allclose(vector, [distance * math.cos(bearing), distance * math.sin(bearing)], atol=1e-9)
