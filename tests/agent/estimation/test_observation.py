@@ -60,7 +60,8 @@ def test_a_landmark_is_a_subject_without_columns(
     kind: str, mount: tuple[float, float, float], x: float, y: float, heading: float, east: float, north: float
 ) -> None:
     observer, stacked = np.array([x, y, heading]), np.array([x, y, heading, east, north])
-    fixed, free = RelativeModel(kind, UNICYCLE, planar_mount(*mount), (east, north)), RelativeModel(kind, UNICYCLE, planar_mount(*mount))
+    fixed = RelativeModel(kind, UNICYCLE, planar_mount(*mount), (east, north))
+    free = RelativeModel(kind, UNICYCLE, planar_mount(*mount))
     assume(float(RelativeModel("range", UNICYCLE, planar_mount(*mount)).h(stacked)[0]) > 0.5)
     assert np.array_equal(fixed.h(observer), free.h(stacked))
     assert np.array_equal(fixed.jacobian(observer), free.jacobian(stacked)[:, :3])
