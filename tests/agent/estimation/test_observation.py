@@ -23,7 +23,8 @@ MOUNT = st.one_of(
     st.tuples(st.just(0.0), st.just(0.0), HEADING),
     st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), HEADING),
 )
-KIND = st.sampled_from(sorted(RELATIVE_ANGLES))
+PLANAR_KINDS = sorted(kind for kind in RELATIVE_ANGLES if kind not in ("pixel", "bearing3"))
+KIND = st.sampled_from(PLANAR_KINDS)
 
 
 def central_difference(model: RelativeModel | AbsoluteModel, at: Array) -> Array:
@@ -149,7 +150,7 @@ def test_derivatives_are_finite_at_the_sensor_itself() -> None:
 def test_derivatives_of_many_states_are_those_of_each() -> None:
     rng = np.random.default_rng(2)
     states = rng.normal(size=(3, 2, 6)) * 4.0
-    for kind in RELATIVE_ANGLES:
+    for kind in PLANAR_KINDS:
         for landmark in (None, (20.0, 3.0)):
             model = RelativeModel(kind, UNICYCLE, planar_mount(0.3, -0.2, 0.5), landmark)
             at = states if landmark is None else states[..., :3]
