@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 
 from agent.config_file import ConfigError
+from sim.metrics import combine
 from sim.recordings.calibrate import main, pair_biases
 from sim.recordings.recording import RecordingError
 from sim.recordings.tiers import load
 from sim.scenario import load as load_scenario
+from sim.summary import reduce
 from sim.trial import open_world, run_trial
 
 T0 = 1_678_960_800
@@ -197,6 +199,14 @@ def test_the_recorded_run_with_calibrated_pairs_is_honest() -> None:
     if not TIERS:
         pytest.skip("COFIX_TIERS does not name the folder of the TIERS recordings")
     path = next(item for item in sorted(Path(TIERS).glob("case4_test3.db3*")))
-    result = run_trial(load_scenario("tiers-uwb", [f"world.path={path}"]), 1)
-    assert set(result.trace.robots) == {f"r{number}" for number in range(1, 8)}
-    assert sum(own["pair.applied_initiator"] for own in result.counters.values()) > 200
+
+    def fleet(*overrides: str, seeds: tuple[int, ...] = (1, 2, 3)) -> dict[str, float]:
+        scenario = load_scenario("tiers-uwb", [f"world.path={path}", *overrides])
+        reduced = [reduce(scenario, run_trial(scenario, seed))["figures"] for seed in seeds]
+        return dict(combine(reduced, scenario.lost_above_m)["fleet"])
+
+    known, unknown = fleet(), fleet("robots.*.sensors.uwb.calibration={}", seeds=(1,))
+    alone = fleet("links.loss=1.0", seeds=(1,))
+    assert known["anees"] <= 1.7
+    assert unknown["anees"] >= 3.0 * known["anees"]
+    assert known["position_rmse_m"] <= 0.6 * min(unknown["position_rmse_m"], alone["position_rmse_m"])
