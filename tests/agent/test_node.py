@@ -206,7 +206,7 @@ def well_formed(draw: st.DrawFn) -> bytes:
         data["t0_ns"] = max(0, t_ns - draw(st.integers(1, 3 * S)))
     elif kind not in ABSOLUTE_KINDS:
         data["of"] = draw(st.sampled_from(["r2", "r2", None, "r1", "r3", "landmark:x", "target:x"]))
-        data["sensor"] = draw(st.sampled_from(["", "camera"]))
+        data["sensor"] = "camera" if kind == "pixel" else draw(st.sampled_from(["", "uwb", "camera"]))
         if draw(st.booleans()):
             data["attitude"] = draw(st.lists(st.floats(-1.5, 1.5), min_size=2, max_size=2))
     return bytes(msgpack.packb(data))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from agent.estimation.gaussian import gain, square_root
 from agent.estimation.motion import UNICYCLE, compose
-from agent.estimation.observation import RelativeModel
+from agent.estimation.observation import RelativeModel, planar_mount
 from agent.estimation.unscented import (
     DEFAULT,
     Transform,
@@ -108,7 +108,7 @@ def test_the_transforms_differ_in_the_second_order_alone() -> None:
 @given(SEED, st.sampled_from(["range", "bearing", "range_bearing"]))
 def test_the_residual_is_a_covariance_and_grows_with_the_belief(seed: int, kind: str) -> None:
     rng = np.random.default_rng(seed)
-    model = RelativeModel(kind, UNICYCLE, (0.2, 0.1, 0.3))
+    model = RelativeModel(kind, UNICYCLE, planar_mount(0.2, 0.1, 0.3))
     mean = np.concatenate([rng.uniform(-2.0, 2.0, size=3), rng.uniform(5.0, 9.0, size=2), [0.0]])
     cov = random_covariance(rng, 6) * 0.02
     found = observe(model.h, model.jacobian, mean, cov, model.angles)
@@ -136,7 +136,7 @@ def test_leading_axes_are_a_loop() -> None:
     rng = np.random.default_rng(6)
     means, covs = rng.normal(size=(2, 3, 3)), random_covariance(rng, 2, 3, 3) * 0.1
     Q = square_root(np.diag([0.01, 0.02, 0.03]))
-    model = RelativeModel("range_bearing", UNICYCLE, (0.2, -0.1, 0.4), (4.0, 9.0))
+    model = RelativeModel("range_bearing", UNICYCLE, planar_mount(0.2, -0.1, 0.4), (4.0, 9.0))
 
     def move(x: Array, w: Array) -> Array:
         return compose(x, np.array([0.5, 0.1, 0.3]) + w)
