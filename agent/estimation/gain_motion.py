@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import square_root, wrap
+from agent.estimation.gaussian import square_root, wrap, wrap_components
 from agent.estimation.motion import PLANAR, UNICYCLE_GAINS, RobotMotion, StateLayout, compose
 from agent.estimation.unscented import DEFAULT, Propagated, Transform, UnscentedParameters, propagate
 
@@ -92,8 +92,10 @@ class GainMotion(RobotMotion):
             image[..., :3] = compose(points[..., :3], scaled(points, increment) + noises)
             return image
 
-        found = propagate(move, mean, cov, root, self.layout.angles, parameters)
-        return Propagated(found.mean, found.cov + walked, found.F)
+        # Headings are added up, never wrapped, on the way: a wrapped deviation of a point that lies half a turn off
+        # would make a heading that is nearly unknown look like a known one.
+        found = propagate(move, mean, cov, root, (), parameters)
+        return Propagated(wrap_components(found.mean, self.layout.angles), found.cov + walked, found.F)
 
 
 def _linearized(mean: Array, increment: Array) -> tuple[Array, Array, Array]:

@@ -108,3 +108,12 @@ def test_a_robot_with_position_fixes_learns_its_gains() -> None:
     assert mean[ALONG] == pytest.approx(0.85, abs=0.02)
     assert mean[TURN] == pytest.approx(0.9, abs=0.02)
     assert np.sqrt(cov[TURN, TURN]) < 0.01
+
+
+@pytest.mark.parametrize("transform", ["unscented", "jacobian"])
+def test_a_heading_nobody_knows_any_more_stays_unknown(transform: str) -> None:
+    mean, cov = np.array([0.0, 0.0, 3.0, 1.0, 1.0]), np.diag([0.1, 0.1, 4.0, 0.01, 0.01])
+    delta, noise = np.array([0.1, 0.0, 0.0, 0.3]), np.diag([1e-4, 0.0, 0.0, 1e-3])
+    moved = GainMotion().advance(mean, cov, delta, noise, 0.1, transform)  # type: ignore[arg-type]
+    assert moved.cov[2, 2] >= 4.0
+    assert -np.pi < moved.mean[2] <= np.pi
