@@ -23,7 +23,7 @@ from agent.timesync import MS, TimeSync, TimeSyncSettings
 from agent.vehicle_fixes import FixSettings, VehicleFixes
 from agent.vehicle_odometry import Increment, OdometryLimits, PoseOdometry, Stamped, VelocityOdometry
 
-FIXES = ("position", "heading")
+FIXES = ("position", "heading", "altitude")
 ODOMETRY_SOURCES = ("odometry", "velocity", "none")
 POSITION_SOURCES = ("global", "local")
 NS = 1_000_000_000
@@ -47,7 +47,7 @@ CHILD_FRAMES = (
 class AutopilotSettings:
     """What is read from the autopilot. All times in ns of fleet time.
 
-    fixes            absolute information used: "position", "heading", both, or none
+    fixes            absolute information used, any of "position", "heading" and "altitude"
     position_source  "global": GLOBAL_POSITION_INT; "local": LOCAL_POSITION_NED with GPS_GLOBAL_ORIGIN
     fix_inflation    R is multiplied by it: positions of an autopilot are filtered, hence correlated in time
     odometry_source  "odometry": ODOMETRY; "velocity": LOCAL_POSITION_NED velocity with ATTITUDE yaw; "none"
@@ -58,6 +58,7 @@ class AutopilotSettings:
     origin: frames.Origin = (0.0, 0.0, 0.0)
     fixes: tuple[str, ...] = ()
     fix_sigma_m: float = 2.0
+    fix_sigma_altitude_m: float = 3.0
     fix_sigma_rad: float = 0.1
     fix_interval_ns: int = NS
     fix_inflation: float = 1.0
@@ -102,7 +103,7 @@ def _wanted(settings: AutopilotSettings) -> list[Wanted]:
     elif settings.odometry_source == "velocity":
         want(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, motion)
         want(dialect.MAVLINK_MSG_ID_ATTITUDE, motion)
-    if "position" in settings.fixes:
+    if _reads_place(settings):
         want(dialect.MAVLINK_MSG_ID_GPS_RAW_INT, NS)
         if settings.position_source == "global":
             want(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, fix)
@@ -112,6 +113,10 @@ def _wanted(settings: AutopilotSettings) -> list[Wanted]:
     if _reads_attitude_heading(settings):
         want(dialect.MAVLINK_MSG_ID_ATTITUDE, fix)
     return [Wanted(dialect.mavlink_map[key].msgname, key, interval) for key, interval in intervals.items()]
+
+
+def _reads_place(settings: AutopilotSettings) -> bool:
+    return "position" in settings.fixes or "altitude" in settings.fixes
 
 
 def _reads_attitude_heading(settings: AutopilotSettings) -> bool:
@@ -130,6 +135,8 @@ def _fix_settings(settings: AutopilotSettings) -> FixSettings:
         interval_ns=settings.fix_interval_ns,
         inflation=settings.fix_inflation,
         max_distance_m=settings.max_distance_m,
+        altitude="altitude" in settings.fixes,
+        sigma_altitude_m=settings.fix_sigma_altitude_m,
     )
 
 
@@ -381,7 +388,7 @@ class AutopilotReader:
 
     def _on_local_position(self, now_ns: int, message: Any) -> list[Output]:
         by_velocity = self._settings.odometry_source == "velocity"
-        as_fix = "position" in self._settings.fixes and self._settings.position_source == "local"
+        as_fix = _reads_place(self._settings) and self._settings.position_source == "local"
         position = np.array([message.x, message.y, message.z], dtype=np.float64)
         velocity = np.array([message.vx, message.vy, message.vz], dtype=np.float64)
         if not (by_velocity or as_fix) or not self._finite(*position, *velocity):
@@ -398,7 +405,7 @@ class AutopilotReader:
         return outputs
 
     def _on_global_position(self, now_ns: int, message: Any) -> list[Output]:
-        if "position" not in self._settings.fixes or self._settings.position_source != "global":
+        if not _reads_place(self._settings) or self._settings.position_source != "global":
             return []
         _, t_ns = self._boot_stamp(now_ns, message.time_boot_ms)
         if t_ns is None:
@@ -406,7 +413,7 @@ class AutopilotReader:
         return [*self._fixes.global_position(now_ns, t_ns, message.lat, message.lon, message.alt, message.hdg)]
 
     def _on_gps(self, now_ns: int, message: Any) -> list[Output]:
-        self._fixes.gps(now_ns, message.fix_type, message.h_acc)
+        self._fixes.gps(now_ns, message.fix_type, message.h_acc, message.v_acc)
         return []
 
     def _on_origin(self, now_ns: int, message: Any) -> list[Output]:

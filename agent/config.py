@@ -107,8 +107,9 @@ class MavlinkPart(Part):
 
     endpoint: str
     simulated: bool = False
-    fixes: list[Literal["position", "heading"]] = []
+    fixes: list[Literal["position", "heading", "altitude"]] = []
     fix_sigma_m: Positive = 2.0
+    fix_sigma_altitude_m: Positive = 3.0
     fix_sigma_rad: Positive = 0.1
     fix_interval_s: NotNegative = 1.0
     fix_inflation: Annotated[float, Field(ge=1.0)] = 1.0
@@ -125,6 +126,7 @@ class MavlinkPart(Part):
             origin=(origin[0], origin[1], origin[2]),
             fixes=tuple(self.fixes),
             fix_sigma_m=self.fix_sigma_m,
+            fix_sigma_altitude_m=self.fix_sigma_altitude_m,
             fix_sigma_rad=self.fix_sigma_rad,
             fix_interval_ns=nanoseconds(self.fix_interval_s),
             fix_inflation=self.fix_inflation,

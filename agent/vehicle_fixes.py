@@ -22,7 +22,7 @@ GPS_FRESH_NS = 5_000_000_000
 GPS_3D_FIX = 3
 HDG_MAX_CDEG = 36000
 HDG_UNKNOWN = 65535
-H_ACC_UNKNOWN = (0, 2**32 - 1)
+ACC_UNKNOWN = (0, 2**32 - 1)
 LAT_MAX, LON_MAX = 900_000_000, 1_800_000_000
 
 
@@ -39,15 +39,18 @@ class FixSettings:
     interval_ns: int
     inflation: float
     max_distance_m: float
+    altitude: bool = False
+    sigma_altitude_m: float = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class GpsReport:
-    """Last GPS_RAW_INT: when, fix type, horizontal accuracy [m] (None: unknown)."""
+    """Last GPS_RAW_INT: when, fix type, horizontal and vertical accuracy [m] (None: unknown)."""
 
     t_ns: int
     fix_type: int
     accuracy_m: float | None
+    vertical_m: float | None
 
 
 class VehicleFixes:
@@ -65,10 +68,11 @@ class VehicleFixes:
         self._gps = None
         self._local_origin = None
 
-    def gps(self, now_ns: int, fix_type: int, h_acc_mm: int) -> None:
+    def gps(self, now_ns: int, fix_type: int, h_acc_mm: int, v_acc_mm: int = 0) -> None:
         """GPS_RAW_INT: the state and accuracy behind the next positions."""
-        accuracy = None if h_acc_mm in H_ACC_UNKNOWN else h_acc_mm * 1e-3
-        self._gps = GpsReport(now_ns, fix_type, accuracy)
+        accuracy = None if h_acc_mm in ACC_UNKNOWN else h_acc_mm * 1e-3
+        vertical = None if v_acc_mm in ACC_UNKNOWN else v_acc_mm * 1e-3
+        self._gps = GpsReport(now_ns, fix_type, accuracy, vertical)
 
     def origin(self, lat: int, lon: int, alt_mm: int) -> None:
         """GPS_GLOBAL_ORIGIN (1e-7 deg, mm): where the autopilot's local frame lies."""
@@ -86,12 +90,15 @@ class VehicleFixes:
         return [self._fix(now_ns, t_ns, "heading", [heading], [self._settings.sigma_rad])]
 
     def global_position(self, now_ns: int, t_ns: int, lat: int, lon: int, alt_mm: int, hdg_cdeg: int) -> list[Fix]:
-        """GLOBAL_POSITION_INT (1e-7 deg, mm, 0.01 deg): a `pose`, or a `position` without a usable heading."""
+        """GLOBAL_POSITION_INT (1e-7 deg, mm, 0.01 deg): a `pose`, or a `position` without a usable heading.
+
+        With their altitude if that is wanted; an `altitude` if that alone is.
+        """
         place = self._geodetic(lat, lon, alt_mm)
         if place is None:
             return []
         heading: float | None = None
-        if self._settings.heading:
+        if self._settings.heading and self._settings.position:
             if hdg_cdeg <= HDG_MAX_CDEG:
                 heading = frames.heading_from_yaw(math.radians(hdg_cdeg / 100.0))
             else:
@@ -112,18 +119,22 @@ class VehicleFixes:
 
     def _position(self, now_ns: int, t_ns: int, point: Array, heading: float | None) -> list[Fix]:
         settings = self._settings
-        if math.hypot(point[0], point[1]) > settings.max_distance_m:
+        if float(np.linalg.norm(point)) > settings.max_distance_m:
             self._counters["mavlink.far_away"] += 1
             return []
-        sigma_m = settings.sigma_m
+        sigma_m, sigma_z_m = settings.sigma_m, settings.sigma_altitude_m
         if self._gps is not None and now_ns - self._gps.t_ns <= GPS_FRESH_NS:
             if self._gps.fix_type < GPS_3D_FIX:
                 self._counters["mavlink.no_gps_fix"] += 1
                 return []
             sigma_m = max(sigma_m, self._gps.accuracy_m or 0.0)
+            sigma_z_m = max(sigma_z_m, self._gps.vertical_m or 0.0)
         if not self._thinned("position", t_ns):
             return []
-        z, sigma = [float(point[0]), float(point[1])], [sigma_m, sigma_m]
+        x, y, up = (float(value) for value in point)
+        if not settings.position:
+            return [self._fix(now_ns, t_ns, "altitude", [up], [sigma_z_m])]
+        z, sigma = ([x, y, up], [sigma_m, sigma_m, sigma_z_m]) if settings.altitude else ([x, y], [sigma_m, sigma_m])
         if heading is None:
             return [self._fix(now_ns, t_ns, "position", z, sigma)]
         return [self._fix(now_ns, t_ns, "pose", [*z, heading], [*sigma, settings.sigma_rad])]
@@ -152,7 +163,7 @@ class VehicleFixes:
 
     def reasons(self) -> list[str]:
         """Why there are no fixes."""
-        if not self._settings.position:
+        if not (self._settings.position or self._settings.altitude):
             return []
         found = []
         if self._settings.local and self._local_origin is None:

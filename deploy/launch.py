@@ -23,10 +23,11 @@ from typing import Any
 
 import tomli_w
 
+from agent.estimation.motion import LAYOUTS
 from agent.settings import NS
 from network.transport import free_port
 from network.zenoh_transport import link_pair
-from sim.agents import agent_tables, odometry_table, table
+from sim.agents import agent_tables, autopilot_fix, odometry_table, table
 from sim.host import HostPlan, plan_json
 from sim.scenario import RobotPart, Scenario, sensor_kind
 from sim.world import World
@@ -92,7 +93,7 @@ def agent_file(
     lateness = tables["lateness"]
     lateness["settle_s"] = max(lateness["settle_s"], SETTLE_WALL_S * speed)
     lateness["tolerance_s"] = max(lateness["tolerance_s"], STAMP_WALL_S * speed)
-    pose = next((s for n, s in robot.sensors.items() if sensor_kind(n, s) == "pose"), None)
+    fix = autopilot_fix(robot)
     mavlink: dict[str, Any] = {
         "endpoint": f"udpin:127.0.0.1:{plan.mavlink_ports[robot.id]}",
         "simulated": True,
@@ -100,13 +101,14 @@ def agent_file(
         "odometry": odometry_table(scenario, robot),
         "rate_hz": 1.0 / scenario.step_s,
     }
-    if pose is not None and "global_position" in robot.autopilot.sends:
-        mavlink |= {
-            "fixes": ["position", "heading"],
-            "fix_sigma_m": pose.sigma_m,
-            "fix_sigma_rad": pose.sigma_rad,
-            "fix_interval_s": 0.0,
-        }
+    if fix is not None:
+        sensor = robot.sensors[fix]
+        mavlink |= {"fixes": ["position"], "fix_sigma_m": sensor.sigma_m, "fix_interval_s": 0.0}
+        if sensor_kind(fix, sensor) == "pose":
+            mavlink |= {"fixes": [*mavlink["fixes"], "heading"], "fix_sigma_rad": sensor.sigma_rad}
+        if LAYOUTS[robot.model].altitude is not None:
+            sigma_m = sensor.sigma_z_m or sensor.sigma_m
+            mavlink |= {"fixes": [*mavlink["fixes"], "altitude"], "fix_sigma_altitude_m": sigma_m}
     return tables | {
         "clock": {"source": "run", "speed": speed},
         "lateness": lateness,

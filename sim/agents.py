@@ -69,6 +69,14 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
     }
 
 
+def autopilot_fix(robot: RobotPart) -> str | None:
+    """The sensor whose fixes come from the autopilot: a pose, or else a position; None if it has no global position."""
+    kinds = {name: sensor_kind(name, sensor) for name, sensor in robot.sensors.items()}
+    if "global_position" not in robot.autopilot.sends:
+        return None
+    return next((name for kind in ("pose", "position") for name, found in kinds.items() if found == kind), None)
+
+
 def agent_config(scenario: Scenario, world: World, robot: RobotPart) -> AgentConfig:
     """The validated configuration used in virtual time."""
     return validate(AgentConfig, agent_tables(scenario, world, robot), robot.id)

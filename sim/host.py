@@ -18,11 +18,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from agent.control import ControlLine
+from agent.estimation.motion import LAYOUTS
 from agent.fleet_clock import FleetClock
 from agent.sensor_input import encode
 from network.link_feed import LinkFeed
+from sim.agents import autopilot_fix
 from sim.autopilot import StandIn, StandInServer
 from sim.reach import Reach
 from sim.scenario import RobotPart, load
@@ -30,6 +33,7 @@ from sim.trial import open_world
 from sim.vehicle_telemetry import StandInSettings
 from sim.world import Output, World
 
+VEHICLES = {False: dialect.MAV_TYPE_GROUND_ROVER, True: dialect.MAV_TYPE_QUADROTOR}
 BOOT_LEAD_NS = 30_000_000_000
 FINAL_WALL_S = 0.5
 
@@ -62,6 +66,7 @@ class WorldHost:
         self._reach = None if links.range_m is None else Reach(self._world, links.range_m, links.hysteresis_m)
         self._feed = LinkFeed()
         self._parts: dict[str, RobotPart] = {robot.id: robot for robot in self._scenario.robots}
+        self._fixes = {robot.id: autopilot_fix(robot) for robot in self._scenario.robots}
         self._servers: dict[str, StandInServer] = {}
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
@@ -109,6 +114,7 @@ class WorldHost:
                 sends=tuple(part.autopilot.sends),
                 origin=(self._scenario.origin[0], self._scenario.origin[1], self._scenario.origin[2]),
                 boot_ns=clock.t0_ns - BOOT_LEAD_NS,
+                vehicle_type=VEHICLES[LAYOUTS[part.model].altitude is not None],
             )
             server = StandInServer(StandIn(settings), f"udpout:127.0.0.1:{port}", clock)
             await server.start()
@@ -149,20 +155,23 @@ class WorldHost:
             self._feed.publish(t_ns, self._world.robots, self._reach.at(k))
 
     def _place(self, robot: str, k: int, t_ns: int) -> None:
-        x, y, heading = self._world.truth(robot, k)[:3]
-        self._servers[robot].stand_in.set_state(t_ns, x, y, 0.0, heading, 0.0, 0.0, 0.0, 0.0)
+        x, y, z = self._world.place(robot, k).tolist()
+        layout = LAYOUTS[self._parts[robot].model]
+        assert layout.heading is not None
+        heading = float(self._world.truth(robot, k)[layout.heading])
+        self._servers[robot].stand_in.set_state(t_ns, x, y, z, heading, 0.0, 0.0, 0.0, 0.0)
 
     def _emit(self, k: int, t_ns: int, items: list[Output]) -> None:
         """Odometry and fixes by MAVLink, all else to the sensor sockets."""
         moved = []
         for item in items:
-            part = self._parts[item.robot]
             stand_in = self._servers[item.robot].stand_in
             if item.kind == "odometry":
                 stand_in.set_odometry(t_ns, item.z)
                 moved.append(item.robot)
-            elif item.kind == "pose" and "global_position" in part.autopilot.sends:
-                stand_in.set_fix(t_ns, item.z[0], item.z[1], 0.0, item.z[2])
+            elif item.of is None and item.sensor == self._fixes[item.robot]:
+                place, heading = (item.z[:-1], item.z[-1]) if item.kind == "pose" else (item.z, None)
+                stand_in.set_fix(t_ns, place[0], place[1], place[2] if len(place) == 3 else 0.0, heading)
             else:
                 self._send_sensor(item, t_ns)
         for robot in moved:
@@ -170,9 +179,7 @@ class WorldHost:
             self._servers[robot].push(t_ns)
 
     def _send_sensor(self, item: Output, t_ns: int) -> None:
-        payload = encode(
-            t_ns, item.kind, item.z, item.R, of=item.of, sensor=item.sensor, attitude=item.attitude
-        )
+        payload = encode(t_ns, item.kind, item.z, item.R, of=item.of, sensor=item.sensor, attitude=item.attitude)
         try:
             self._socket.sendto(payload, self._plan.sensor_sockets[item.robot])
         except OSError:

@@ -334,6 +334,11 @@ def check(scenario: Scenario) -> None:
         )
     for robot in scenario.robots:
         _check_mover(f"{scenario.name}: robots.{robot.id}", robot)
+        if recorded and LAYOUTS[robot.model].altitude is not None:
+            raise ConfigError(
+                f"{scenario.name}: robots.{robot.id}.model = '{robot.model}' has an altitude, and recordings are "
+                "planar; take 'unicycle'"
+            )
         scenario.localization_of(robot), scenario.lateness_of(robot), scenario.tracking_of(robot)
         if not recorded and (robot.start.pose is None) == (robot.start.circle is None):
             raise ConfigError(f"{scenario.name}: robots.{robot.id}.start needs either 'pose' or 'circle'")

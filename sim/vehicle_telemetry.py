@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 MS = 1_000_000
 NAN = math.nan
+HDG_UNKNOWN = 65535
 FLAVOURS = {"ardupilot": dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": dialect.MAV_AUTOPILOT_PX4}
 SENDS = ("odometry", "global_position", "attitude", "local_position")
 
@@ -81,6 +82,7 @@ class Telemetry:
         self._origin: frames.Origin | None = None
         self._truth: Pose | None = None
         self._fix: Pose | None = None
+        self._fix_has_heading = True
         self._global: Pose | None = None
         self._state_velocity = np.zeros(4)
         self.reboot(settings.boot_ns)
@@ -125,9 +127,15 @@ class Telemetry:
             self._global = self._truth
             self._know_origin(self._truth)
 
-    def set_fix(self, t_ns: int, x: float, y: float, z: float, heading: float) -> None:
-        """What the vehicle's global estimate says at `t_ns`, errors included: fleet ENU [m], [rad]."""
-        self._fix = Pose(t_ns, np.array([x, y, z], dtype=np.float64), heading)
+    def set_fix(self, t_ns: int, x: float, y: float, z: float, heading: float | None) -> None:
+        """What the vehicle's global estimate says at `t_ns`, errors included: fleet ENU [m], [rad].
+
+        Without a heading the vehicle goes by that of its drifting local frame, and does not tell where it heads.
+        """
+        self._fix_has_heading = heading is not None
+        self._fix = Pose(
+            t_ns, np.array([x, y, z], dtype=np.float64), self._local.heading if heading is None else heading
+        )
         self._global = self._fix
         self._know_origin(self._fix)
 
@@ -267,6 +275,8 @@ class Telemetry:
         velocity = frames.enu_to_ned(frames.from_level_body(self._velocity()[:3], pose.heading))
         vx, vy, vz = (int(np.clip(round(100.0 * float(v)), -32767, 32767)) for v in velocity)
         hdg = round(math.degrees(frames.yaw_from_heading(pose.heading)) * 100.0) % 36000
+        if self._fix is not None and not self._fix_has_heading:
+            hdg = HDG_UNKNOWN
         return dialect.MAVLink_global_position_int_message(
             self._boot_ms(stamp),
             round(lat * 1e7),
