@@ -354,10 +354,10 @@ def check(scenario: Scenario) -> None:
                 f"{scenario.name}: targets.{target.id}.recorded = {str(recorded).lower()} is needed in a "
                 f"{scenario.world.kind} world"
             )
-        if recorded and LAYOUTS[target.model].heading is not None:
+        if recorded and (LAYOUTS[target.model].heading is not None or LAYOUTS[target.model].dim != 4):
             raise ConfigError(
-                f"{scenario.name}: targets.{target.id}.model = '{target.model}' needs a control, and nobody knows that "
-                "of a recorded target; take 'damped_velocity' or 'constant_velocity'"
+                f"{scenario.name}: targets.{target.id}.model = '{target.model}' needs what nobody knows of a "
+                "recorded target; take 'damped_velocity' or 'constant_velocity'"
             )
         if not recorded and target.start.pose is None:
             raise ConfigError(f"{scenario.name}: targets.{target.id}.start.pose is missing")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections import Counter
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
@@ -15,10 +16,11 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from agent import frames
-from agent.autopilot import AutopilotReader, AutopilotSettings
+from agent.autopilot import AutopilotReader, AutopilotSettings, _fix_settings
 from agent.estimation.motion import between, compose
 from agent.estimation.odometry import OdometryNoise
 from agent.events import Fix, Odometry
+from agent.vehicle_fixes import VehicleFixes
 from sim.autopilot import StandIn, StandInSettings
 
 S = 1_000_000_000
@@ -395,6 +397,62 @@ def test_a_local_position_is_used_once_its_origin_is_known() -> None:
     assert desk.fixes[-1].kind == "position"
 
 
+@pytest.mark.parametrize(
+    ("fixes", "kind", "size"),
+    [
+        (("position", "heading", "altitude"), "pose", 4),
+        (("position", "altitude"), "position", 3),
+        (("altitude",), "altitude", 1),
+    ],
+)
+def test_a_fix_has_the_altitude_if_that_is_named(fixes: tuple[str, ...], kind: str, size: int) -> None:
+    desk = Desk(reader=fix_settings(fixes=fixes, fix_sigma_m=0.5, fix_sigma_altitude_m=0.25, fix_sigma_rad=0.01))
+    desk.warm_up()
+    desk.now_ns += 100 * MS
+    desk.vehicle.set_fix(desk.now_ns, 3.0, -4.0, 17.5, 0.3)
+    desk.exchange()
+    desk.to_reader(desk.vehicle.push(desk.now_ns))
+    (fix,) = desk.fixes
+    whole = {"pose": [3.0, -4.0, 17.5, 0.3], "position": [3.0, -4.0, 17.5], "altitude": [17.5]}[kind]
+    sigma = {"pose": [0.5, 0.5, 0.25, 0.01], "position": [0.5, 0.5, 0.25], "altitude": [0.25]}[kind]
+    assert (fix.kind, len(fix.z), fix.t_meas_ns) == (kind, size, pytest.approx(desk.now_ns, abs=MS))
+    assert np.allclose(fix.z, whole, atol=0.02)
+    assert np.allclose(np.sqrt(np.diagonal(fix.R)), sigma)
+
+
+def test_the_altitude_of_a_local_position_is_at_the_fleets_origin() -> None:
+    desk = Desk(reader=fix_settings(fixes=("position", "altitude"), position_source="local"))
+    for k in range(60):
+        desk.now_ns += 100 * MS
+        desk.vehicle.set_fix(desk.now_ns, 1.0, 2.0, 10.0 + 0.1 * k, 0.0)
+        desk.exchange()
+        desk.to_reader(desk.vehicle.push(desk.now_ns))
+    assert np.allclose(desk.fixes[-1].z, [1.0, 2.0, 15.9], atol=0.02)
+
+
+def test_a_vehicle_without_a_compass_tells_no_heading() -> None:
+    desk = Desk(reader=fix_settings(fixes=("position", "heading", "altitude")))
+    desk.warm_up()
+    desk.now_ns += 100 * MS
+    desk.vehicle.set_fix(desk.now_ns, 3.0, -4.0, 17.5, None)
+    desk.exchange()
+    desk.to_reader(desk.vehicle.push(desk.now_ns))
+    assert [(fix.kind, len(fix.z)) for fix in desk.fixes] == [("position", 3)]
+    assert desk.reader.counters["mavlink.no_heading"] == 1
+
+
+def test_the_gps_own_vertical_accuracy_counts_when_it_is_worse() -> None:
+    fixes = VehicleFixes(_fix_settings(AutopilotSettings(origin=ORIGIN, fixes=("altitude",))), Counter())
+    fixes.gps(T0, 3, 0, 7_000)
+    (fix,) = fixes.global_position(T0, T0, 473_977_420, 85_455_940, 498_000, 0)
+    assert np.allclose(fix.z, [10.0])
+    assert np.allclose(fix.R, [[49.0]])
+    assert fixes.reasons() == []
+    fixes.gps(T0, 1, 0, 0)
+    assert fixes.global_position(T0, T0 + S, 473_977_420, 85_455_940, 498_000, 0) == []
+    assert fixes.reasons() != []
+
+
 def test_nan_attitude_is_counted() -> None:
     desk = Desk(reader=fix_settings(fixes=("heading",)))
     desk.warm_up()
@@ -635,8 +693,8 @@ def test_a_dead_link_says_why() -> None:
 def test_wrong_settings_name_the_key_and_what_is_valid() -> None:
     with pytest.raises(ValueError, match=r"odometry_source: 'wheel' is unknown; valid: odometry, velocity, none"):
         AutopilotSettings(odometry_source="wheel")
-    with pytest.raises(ValueError, match=r"fixes: 'altitude'"):
-        AutopilotSettings(fixes=("position", "altitude"))
+    with pytest.raises(ValueError, match=r"fixes: 'depth' is unknown; valid: position, heading, altitude"):
+        AutopilotSettings(fixes=("position", "depth"))
     with pytest.raises(ValueError, match="system_id"):
         AutopilotSettings(system_id=0)
     with pytest.raises(ValueError, match="message_interval_ns"):

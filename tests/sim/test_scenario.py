@@ -168,7 +168,7 @@ def test_a_recording_needs_its_path_and_has_no_more_than_it_holds() -> None:
     target = 'targets=[{id="t1",start={pose=[0,0,0]},start_sigma={position_m=1.0,heading_rad=1.0}}]'
     assert "targets.t1.recorded = true is needed" in complaint(path, target, name="utias-all")
     recorded = target.replace('"t1",', '"t1",recorded=true,')
-    assert "nobody knows that" in complaint(path, recorded, name="utias-all")
+    assert "nobody knows of" in complaint(path, recorded, name="utias-all")
     assert "recorded = false is needed in a simulated world" in complaint(recorded)
 
 

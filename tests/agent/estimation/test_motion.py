@@ -11,24 +11,34 @@ from scipy.linalg import expm
 
 from agent.estimation.gaussian import square_root, wrap
 from agent.estimation.motion import (
+    CONSTANT_ACCELERATION,
     CONSTANT_VELOCITY,
+    CONSTANT_VELOCITY_3D,
     DAMPED_VELOCITY,
+    DAMPED_VELOCITY_3D,
     LAYOUTS,
+    SPATIAL,
+    STATES,
     UNICYCLE,
+    HeldAltitude,
+    SpatialMotion,
     StateLayout,
     TargetMotion,
     advance,
+    advance_spatial,
     between,
     compose,
     split_increment,
     velocity_step,
 )
+from network.wire import MODEL_DIMS
 
 Array = NDArray[np.float64]
 
 METRE = st.floats(-50.0, 50.0)
 POSE = st.tuples(METRE, METRE, st.floats(-3.14, 3.14)).map(np.array)
 VELOCITY_LAYOUTS = (CONSTANT_VELOCITY, DAMPED_VELOCITY)
+STEPPED = (*VELOCITY_LAYOUTS, CONSTANT_VELOCITY_3D, DAMPED_VELOCITY_3D, CONSTANT_ACCELERATION)
 
 
 def assert_same_pose(first: Array, second: Array) -> None:
@@ -107,8 +117,8 @@ def test_advance_wraps_the_heading_and_takes_increments_without_noise(transform:
     assert np.allclose(moved.F, np.eye(3))
 
 
-@pytest.mark.parametrize("layout", VELOCITY_LAYOUTS)
-@given(st.floats(1e-5, 20.0), st.floats(0.05, 0.95), st.floats(0.1, 1e5))
+@pytest.mark.parametrize("layout", STEPPED)
+@given(st.floats(1e-3, 20.0), st.floats(0.05, 0.95), st.floats(0.1, 1e5))
 def test_a_velocity_step_is_its_parts_in_turn(
     layout: StateLayout, dt: float, fraction: float, damping_s: float
 ) -> None:
@@ -136,18 +146,31 @@ def test_the_noise_of_a_damped_velocity_is_a_covariance_however_short_the_step(d
     square_root(Q)
 
 
-@pytest.mark.parametrize(("layout", "rate"), [(CONSTANT_VELOCITY, 0.0), (DAMPED_VELOCITY, 0.5), (DAMPED_VELOCITY, 3.0)])
+@pytest.mark.parametrize(
+    ("layout", "rate"),
+    [
+        (CONSTANT_VELOCITY, 0.0),
+        (DAMPED_VELOCITY, 0.5),
+        (DAMPED_VELOCITY, 3.0),
+        (CONSTANT_VELOCITY_3D, 0.0),
+        (DAMPED_VELOCITY_3D, 0.5),
+        (CONSTANT_ACCELERATION, 0.0),
+    ],
+)
 @pytest.mark.parametrize("dt", [0.01, 0.4, 2.0])
 def test_a_velocity_step_is_van_loans(layout: StateLayout, rate: float, dt: float) -> None:
     """Van Loan 1978: expm([[-A, G], [0, A^T]] dt) holds F and Q of dx = A x dt + noise."""
-    A, G = np.zeros((4, 4)), np.diag([0.0, 0.0, 1.0, 1.0])
-    A[0, 2] = A[1, 3] = 1.0
-    A[2, 2] = A[3, 3] = -rate
-    blocks = expm(np.block([[-A, G], [np.zeros((4, 4)), A.T]]) * dt)
-    expected_F = blocks[4:, 4:].T
+    n, axes = layout.dim, len(layout.position)
+    A, G = np.zeros((n, n)), np.zeros((n, n))
+    for row in range(n - axes):
+        A[row, row + axes] = 1.0
+    for row in range(n - axes, n):
+        A[row, row], G[row, row] = -rate, 1.0
+    blocks = expm(np.block([[-A, G], [np.zeros((n, n)), A.T]]) * dt)
+    expected_F = blocks[n:, n:].T
     F, Q = velocity_step(layout, dt, 1.0 / rate if rate else 2.0)
     assert np.allclose(F, expected_F, rtol=1e-10, atol=1e-13)
-    assert np.allclose(Q, expected_F @ blocks[:4, 4:], rtol=1e-8, atol=1e-13)
+    assert np.allclose(Q, expected_F @ blocks[:n, n:], rtol=1e-8, atol=1e-13)
 
 
 def test_a_weakly_damped_velocity_is_a_constant_velocity() -> None:
@@ -222,14 +245,132 @@ def test_drift_of_a_unicycle_covers_targets_driven_at_random() -> None:
 
 
 def test_layouts_are_known_by_their_names() -> None:
-    assert {name: (layout.dim, layout.angles, layout.heading) for name, layout in LAYOUTS.items()} == {
-        "unicycle": (3, (2,), 2),
-        "unicycle_gains": (5, (2,), 2),
-        "constant_velocity": (4, (), None),
-        "damped_velocity": (4, (), None),
-        "constant_velocity_3d": (6, (), None),
-        "damped_velocity_3d": (6, (), None),
-        "constant_acceleration": (6, (), None),
-        "quadrotor": (4, (3,), 3),
-        "planar_altitude": (4, (3,), 3),
+    expected = {
+        "unicycle": (3, (2,), 2, None),
+        "unicycle_gains": (5, (2,), 2, None),
+        "spatial": (4, (3,), 3, 2),
+        "constant_velocity": (4, (), None, None),
+        "damped_velocity": (4, (), None, None),
+        "constant_velocity_3d": (6, (), None, 2),
+        "damped_velocity_3d": (6, (), None, 2),
+        "constant_acceleration": (6, (), None, None),
     }
+    assert {n: (lay.dim, lay.angles, lay.heading, lay.altitude) for n, lay in STATES.items()} == expected
+    assert {name: layout.name for name, layout in LAYOUTS.items() if name != layout.name} == {
+        "quadrotor": "spatial",
+        "planar_altitude": "spatial",
+    }
+    assert {name: layout.dim for name, layout in STATES.items()} == MODEL_DIMS
+
+
+# --- with an altitude --------------------------------------------------------------------------------------
+
+HELD = HeldAltitude(16.5, 0.1)
+POSE3 = st.tuples(METRE, METRE, METRE, st.floats(-3.1, 3.1)).map(np.array)
+COV4 = np.array([[0.2, 0.05, 0.01, 0.01], [0.05, 0.3, 0.02, 0.0], [0.01, 0.02, 0.25, 0.01], [0.01, 0.0, 0.01, 0.03]])
+NOISE4 = np.diag([0.01, 0.02, 0.03, 0.001])
+
+
+def moved_by_hand(state: Array, move: Array, held: HeldAltitude | None, w: float = 0.0) -> Array:
+    pose = compose(state[[0, 1, 3]], move[[0, 1, 3]])
+    return np.array([pose[0], pose[1], state[2] + move[2] if held is None else held.altitude_m + w, pose[2]])
+
+
+@pytest.mark.parametrize("held", [None, HELD])
+@given(POSE3, POSE3)
+def test_the_jacobian_of_a_motion_in_space_is_the_finite_difference(
+    held: HeldAltitude | None, mean: Array, move: Array
+) -> None:
+    assume(abs(float(wrap(mean[3] + move[3]))) < 3.1)
+    found = advance_spatial(mean, COV4, move, NOISE4, "jacobian", held=held)
+    step = 1e-6 * np.eye(4)
+    F = np.stack([moved_by_hand(mean + d, move, held) - moved_by_hand(mean - d, move, held) for d in step], axis=1)
+    G = np.stack(
+        [moved_by_hand(mean, move + d, held, d[2]) - moved_by_hand(mean, move - d, held, -d[2]) for d in step], axis=1
+    )
+    noise = NOISE4.copy()
+    if held is not None:
+        noise[2, 2] = held.sigma_m**2
+    F, G = F / 2e-6, G / 2e-6
+    assert np.allclose(found.F, F, atol=1e-6)
+    assert np.allclose(found.cov, F @ COV4 @ F.T + G @ noise @ G.T, rtol=1e-5, atol=1e-6)
+    assert np.allclose(found.mean[:3], moved_by_hand(mean, move, held)[:3])
+
+
+@pytest.mark.parametrize("held", [None, HELD])
+@given(POSE3, st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-2, 2), st.floats(-1, 1)).map(np.array))
+def test_the_unscented_motion_in_space_tends_to_the_jacobian(
+    held: HeldAltitude | None, mean: Array, move: Array
+) -> None:
+    small = 1e-8
+    held = None if held is None else HeldAltitude(held.altitude_m, 1e-5)
+    first = advance_spatial(mean, COV4 * small, move, NOISE4 * small, "jacobian", held=held)
+    full = advance_spatial(mean, COV4 * small, move, NOISE4 * small, "unscented", held=held)
+    assert np.allclose(full.mean[:3], first.mean[:3], atol=1e-6)
+    assert abs(float(wrap(full.mean[3] - first.mean[3]))) < 1e-9
+    assert np.allclose(full.F, first.F, atol=1e-6)
+    assert np.allclose(full.cov, first.cov, rtol=1e-5, atol=1e-6 * small)
+
+
+@pytest.mark.parametrize("transform", ["unscented", "linearized", "jacobian"])
+def test_a_held_altitude_forgets_the_one_before(transform: str) -> None:
+    """UT-CLAT eq. 33: z' = z_c + w, so F has a zero row, P_zz is the noise alone, and P can still be inverted."""
+    motion = SpatialMotion(held=HELD)
+    moved = motion.advance(
+        np.array([1.0, 2.0, 99.0, 3.0]), COV4, np.array([0.3, 0.0, 0.5, 0.4]), NOISE4, 0.1, transform
+    )  # type: ignore[arg-type]
+    assert moved.mean[2] == pytest.approx(16.5)
+    assert np.allclose(moved.F[2], 0.0)
+    assert np.allclose(moved.cov[2], [0.0, 0.0, 0.01, 0.0], atol=1e-12)
+    assert np.linalg.eigvalsh(moved.cov).min() > 1e-4
+
+
+@given(POSE3, POSE3)
+def test_a_motion_in_space_is_the_planar_one_and_a_climb(mean: Array, move: Array) -> None:
+    cov = COV4.copy()
+    cov[2, [0, 1, 3]] = cov[[0, 1, 3], 2] = 0.0
+    planar = advance(mean[[0, 1, 3]], cov[np.ix_((0, 1, 3), (0, 1, 3))], move, NOISE4, "jacobian")
+    spatial = SpatialMotion().advance(mean, cov, move, NOISE4, 1.0, "jacobian")
+    assert np.allclose(spatial.mean[[0, 1, 3]], planar.mean)
+    assert np.allclose(spatial.cov[np.ix_((0, 1, 3), (0, 1, 3))], planar.cov)
+    assert spatial.mean[2] == pytest.approx(mean[2] + move[2])
+    assert spatial.cov[2, 2] == pytest.approx(0.25 + 0.03)
+
+
+@pytest.mark.parametrize("held", [None, HELD])
+@given(st.floats(0.05, 0.95))
+def test_an_altitude_is_the_same_however_the_increment_is_cut(held: HeldAltitude | None, share: float) -> None:
+    mean, move = np.array([1.0, 2.0, 15.0, 0.4]), np.array([0.8, 0.1, 0.6, 0.3])
+    motion = SpatialMotion(held=held)
+    whole = motion.advance(mean, COV4, move, NOISE4, 1.0, "jacobian")
+    first, first_cov, second, second_cov = split_increment(move, NOISE4, share)
+    half = motion.advance(mean, COV4, first, first_cov, share, "jacobian")
+    both = motion.advance(half.mean, half.cov, second, second_cov, 1.0 - share, "jacobian")
+    assert np.allclose(both.mean, whole.mean)
+    assert np.allclose(both.F @ half.F, whole.F)
+    assert both.cov[2, 2] == pytest.approx(whole.cov[2, 2])
+
+
+def test_a_target_on_the_ground_drifts_in_the_plane_at_its_altitude() -> None:
+    ground = TargetMotion(SPATIAL, (0.5, 0.1), (0.1, 0.05), noise_step_s=0.5, held=HeldAltitude(0.0, 0.05))
+    planar = TargetMotion(UNICYCLE, (0.5, 0.1), (0.1, 0.05), noise_step_s=0.5)
+    cov = np.diag([0.1, 0.2, 0.25, 0.01])
+    drifted = ground.drift(np.array([1.0, 2.0, 0.7, 0.3]), cov, 0.5, "unscented")
+    flat = planar.drift(np.array([1.0, 2.0, 0.3]), np.diag([0.1, 0.2, 0.01]), 0.5, "unscented")
+    assert np.allclose(drifted.mean, [flat.mean[0], flat.mean[1], 0.0, flat.mean[2]], atol=2e-3)
+    assert np.allclose(drifted.cov[np.ix_((0, 1, 3), (0, 1, 3))], flat.cov, rtol=0.05, atol=1e-4)
+    assert drifted.cov[2, 2] == pytest.approx(0.0025)
+
+
+@pytest.mark.parametrize("layout", [CONSTANT_VELOCITY_3D, DAMPED_VELOCITY_3D, CONSTANT_ACCELERATION])
+def test_each_axis_is_driven_by_its_own_noise(layout: StateLayout) -> None:
+    axes = len(layout.position)
+    sigma = (0.3, 0.1, 0.2)[:axes]
+    motion = TargetMotion(layout, noise_sigma=sigma, noise_step_s=0.5, damping_s=1.5)
+    drifted = motion.drift(np.arange(6.0), np.eye(6) * 1e-12, 2.0, "unscented")
+    _, Q = velocity_step(layout, 2.0, 1.5)
+    for axis, one in enumerate(sigma):
+        own = np.arange(axis, 6, axes)
+        assert np.allclose(drifted.cov[np.ix_(own, own)], 0.5 * one**2 * Q[np.ix_(own, own)], rtol=1e-6, atol=1e-10)
+        others = np.setdiff1d(np.arange(6), own)
+        assert np.allclose(drifted.cov[np.ix_(own, others)], 0.0)
