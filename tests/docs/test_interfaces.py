@@ -23,7 +23,15 @@ import tomli_w
 from pydantic import BaseModel
 
 from agent.config import AgentConfig, load_agent_config
-from agent.config_parts import CalibrationPart, ControlNoisePart, ControlPart, LinksPart, OdometryPart, SigmaPart
+from agent.config_parts import (
+    CalibrationPart,
+    ControlNoisePart,
+    ControlPart,
+    IntrinsicsPart,
+    LinksPart,
+    OdometryPart,
+    SigmaPart,
+)
 from agent.events import Observation
 from agent.sensor_input import ABSOLUTE_KINDS, SIZES, decode
 from deploy.cli import main, parser
@@ -117,6 +125,7 @@ def test_the_configuration_is_one(tmp_path: Path) -> None:
 
 PARTS: dict[type[BaseModel], str] = {
     SigmaPart: "start_sigma",
+    IntrinsicsPart: "intrinsics",
     StartPart: "start",
     ControlPart: "control",
     ControlNoisePart: "noise",
