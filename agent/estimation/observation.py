@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import wrap
+from agent.estimation.gaussian import LOWEST
 from agent.estimation.motion import UNICYCLE, StateLayout
 from agent.events import LEVEL, Observation
 from network.messages import NO_MOUNT, Measurement, Mount
@@ -175,6 +176,33 @@ def absolute_model(kind: str, layout: StateLayout, z: Array, R: Array) -> tuple[
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Placed:
+    """A sensor on a levelled body: turn (d, d) into its axes, lever arm (d,) in them.
+
+    `moved` is False if that is the body's own frame, `apart` is True if there is a lever arm.
+    """
+
+    turn: Array
+    lever: Array
+    moved: bool
+    apart: bool
+
+
+@lru_cache(maxsize=256)
+def _placed(mount: Mount, attitude: tuple[float, float], dims: int) -> _Placed:
+    if dims == 2:
+        turn = rotation(0.0, 0.0, mount[5])[:2, :2].T
+    else:
+        turn = rotation(*mount[3:]).T
+    lever = turn @ np.array(mount[:dims])
+    if dims == 3 and attitude != LEVEL:
+        turn = turn @ rotation(*attitude, 0.0).T
+    apart = bool(np.any(lever))
+    turn.flags.writeable = lever.flags.writeable = False
+    return _Placed(turn, lever, apart or not np.array_equal(turn, np.eye(dims)), apart)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RelativeModel:
     """What an observer's sensor measures of a subject.
 
@@ -199,23 +227,13 @@ class RelativeModel:
     attitude: tuple[float, float] = LEVEL
     intrinsics: Intrinsics | None = None
     dims: int = field(init=False)
-    _turn: Array = field(init=False)
-    _lever: Array = field(init=False)
+    _placed: _Placed = field(init=False)
 
     def __post_init__(self) -> None:
         seen = len(self.subject.position) if self.landmark is None else len(self.landmark)
         dims = 3 if self.kind in SPATIAL_KINDS else max(seen, len(self.observer.position))
-        mount = self.mount
-        if dims == 2:
-            cos, sin = math.cos(mount[5]), math.sin(mount[5])
-            turn = np.array([[cos, sin], [-sin, cos]])
-        else:
-            turn = rotation(*mount[3:]).T
-        lever = turn @ np.array(mount[:dims])
-        if dims == 3 and self.attitude != LEVEL:
-            turn = turn @ rotation(*self.attitude, 0.0).T
-        for name, value in (("dims", dims), ("_turn", turn), ("_lever", lever)):
-            object.__setattr__(self, name, value)
+        object.__setattr__(self, "dims", dims)
+        object.__setattr__(self, "_placed", _placed(self.mount, self.attitude, dims))
 
     @property
     def angles(self) -> tuple[int, ...]:
@@ -224,17 +242,17 @@ class RelativeModel:
     @property
     def _turns(self) -> bool:
         """Whether the measurement depends on where the observer heads."""
-        return self.kind != "range" or bool(np.any(self._lever))
+        return self.kind != "range" or self._placed.apart
 
     def _between(self, state: Array) -> Array:
         """Vector (..., dims) from observer to subject in ENU."""
-        own = len(self.observer.position)
+        own, begin = len(self.observer.position), self.observer.dim
+        size = len(self.subject.position) if self.landmark is None else len(self.landmark)
+        place = state[..., begin : begin + size] if self.landmark is None else np.asarray(self.landmark)
+        if own == size == self.dims:
+            return np.asarray(place - state[..., :own])
         d = np.zeros((*state.shape[:-1], self.dims))
-        if self.landmark is not None:
-            d[..., : len(self.landmark)] = self.landmark
-        else:
-            begin, size = self.observer.dim, len(self.subject.position)
-            d[..., :size] = state[..., begin : begin + size]
+        d[..., :size] = place
         d[..., :own] -= state[..., :own]
         return d
 
@@ -244,14 +262,17 @@ class RelativeModel:
             raise ValueError(f"a '{self.kind}' of an observer without heading: '{self.observer.name}'")
         heading = state[..., self.observer.heading]
         cos, sin = np.cos(heading), np.sin(heading)
-        turned = d.copy()
+        turned = np.empty_like(d)
+        turned[..., 2:] = d[..., 2:]
         turned[..., 0] = cos * d[..., 0] + sin * d[..., 1]
         turned[..., 1] = cos * d[..., 1] - sin * d[..., 0]
         return turned
 
     def _in_sensor(self, levelled: Array) -> Array:
         """Where a sensor sees what lies (..., dims) from its robot in the levelled body's frame."""
-        return np.asarray(levelled @ self._turn.T - self._lever)
+        if not self._placed.moved:
+            return levelled
+        return np.asarray(levelled @ self._placed.turn.T - self._placed.lever)
 
     def h(self, state: Array) -> Array:
         """Measurement (..., m) of a stacked state (..., n). Raises `OutOfViewError`."""
@@ -291,10 +312,10 @@ class RelativeModel:
             turn[..., 0, 0], turn[..., 0, 1], turn[..., 1, 0], turn[..., 1, 1] = cos, sin, -sin, cos
             if dims == 3:
                 turn[..., 2, 2] = 1.0
-            turn = self._turn @ turn
+            turn = self._placed.turn @ turn
             across = np.zeros_like(levelled)
             across[..., 0], across[..., 1] = levelled[..., 1], -levelled[..., 0]
-            J[..., self.observer.heading] = across @ self._turn.T
+            J[..., self.observer.heading] = across @ self._placed.turn.T
             s = self._in_sensor(levelled)
         else:
             turn[...] = np.eye(dims)
@@ -348,7 +369,8 @@ def _norm(vector: Array) -> Array:
 
 
 def _azimuth(vector: Array) -> Array:
-    return wrap(np.arctan2(vector[..., 1], vector[..., 0]))
+    # Straight behind is the positive half turn: no negative zero, and not a hair beyond it.
+    return np.maximum(np.arctan2(vector[..., 1] + 0.0, vector[..., 0]), LOWEST)
 
 
 def _in_front(vector: Array) -> None:
