@@ -66,7 +66,7 @@ def figures(name: str, path: str, seed: int, more: tuple[str, ...] = ()) -> dict
         "anees": whole["fleet"]["anees"],
         "anees_max": max(robot["anees"] for robot in whole["robots"].values()),
         "inside_3sigma": _mean([robot["containment_3sigma"] for robot in whole["robots"].values()]),
-        "bytes_per_robot_s": result.network["bytes"] / (result.trace.t_s[-1] * len(scenario.robots)),
+        "bytes_per_robot_s": result.network["bytes"] / (float(result.trace.t_s[-1]) * len(scenario.robots)),
     }
     if case.bound:
         found["bound"] = {

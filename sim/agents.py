@@ -85,7 +85,7 @@ def agent_config(scenario: Scenario, world: World, robot: RobotPart) -> AgentCon
 def odometry_table(scenario: Scenario, robot: RobotPart) -> dict[str, float]:
     """The odometry noise an agent assumes for increments it reads from its autopilot.
 
-    Gains are left at one: the stand-in reports increments that are calibrated already.
+    Gains are left at one and the lag at zero: the stand-in reports increments that are calibrated already.
     """
     noise = control_odometry(robot, scenario.step_s)
     return {
