@@ -12,8 +12,16 @@ import tomli_w
 
 from agent.config import AgentConfig, load_agent_config
 from agent.config_file import ConfigError, validate
-from agent.config_parts import LocalizationPart, OdometryPart, SigmaPart
-from agent.estimation.observation import planar_mount
+from agent.config_parts import (
+    ControlNoisePart,
+    ControlPart,
+    LocalizationPart,
+    OdometryPart,
+    SigmaPart,
+    target_motion,
+)
+from agent.estimation.motion import SPATIAL, HeldAltitude, SpatialMotion
+from agent.estimation.observation import Intrinsics, planar_mount
 
 
 def example(**change: Any) -> dict[str, Any]:
@@ -114,6 +122,77 @@ def test_a_belief_needs_the_deviation_its_model_asks_for() -> None:
         SigmaPart(position_m=1.0, heading_rad=1.0).covariance("damped_velocity")
 
 
+def test_a_file_of_a_drone(tmp_path: Path) -> None:
+    data = example(
+        motion={"model": "quadrotor", "altitude_m": 15.0, "altitude_sigma_m": 0.1},
+        initial={
+            "mean": [1.0, 2.0, 14.0, 0.5],
+            "start_sigma": {"position_m": 0.5, "altitude_m": 0.2, "heading_rad": 0.1},
+        },
+        landmarks=[{"id": "L3", "position": [4.0, 5.0, 2.5]}],
+        sensors={
+            "camera": {
+                "kind": "pixel",
+                "mount": [0.1, 0.0, -0.05, 0.0, 1.5, 0.2],
+                "intrinsics": {"focal_px": 400.0, "size_px": [800.0, 600.0]},
+            }
+        },
+        mavlink={"endpoint": "udpin:127.0.0.1:14550", "fixes": ["position", "altitude"], "fix_sigma_altitude_m": 0.7},
+    )
+    config = load_agent_config(write(tmp_path, data))
+    settings = config.settings(0)
+    assert settings.motion == SpatialMotion(held=HeldAltitude(15.0, 0.1))
+    assert settings.layout is SPATIAL
+    np.testing.assert_array_equal(settings.mean, [1.0, 2.0, 14.0, 0.5])
+    np.testing.assert_allclose(settings.cov, np.diag([0.25, 0.25, 0.04, 0.01]))
+    assert settings.landmarks == {"L3": (4.0, 5.0, 2.5)}
+    camera = config.sensor_configs()["camera"]
+    assert camera.mount == (0.1, 0.0, -0.05, 0.0, 1.5, 0.2)
+    assert camera.intrinsics == Intrinsics(400.0, (400.0, 300.0), (800.0, 600.0))
+    assert config.mavlink is not None
+    assert config.mavlink.settings([0.0, 0.0, 0.0]).fix_sigma_altitude_m == 0.7
+
+
+@pytest.mark.parametrize(
+    ("model", "variances"),
+    [
+        ("unicycle", [1.0, 1.0, 9.0]),
+        ("unicycle_gains", [1.0, 1.0, 9.0, 36.0, 49.0]),
+        ("quadrotor", [1.0, 1.0, 4.0, 9.0]),
+        ("planar_altitude", [1.0, 1.0, 4.0, 9.0]),
+        ("damped_velocity", [1.0, 1.0, 16.0, 16.0]),
+        ("constant_velocity_3d", [1.0, 1.0, 4.0, 16.0, 16.0, 16.0]),
+        ("constant_acceleration", [1.0, 1.0, 16.0, 16.0, 25.0, 25.0]),
+    ],
+)
+def test_a_belief_has_the_deviations_of_its_model(model: str, variances: list[float]) -> None:
+    part = SigmaPart(
+        position_m=1.0,
+        altitude_m=2.0,
+        heading_rad=3.0,
+        velocity_mps=4.0,
+        acceleration_mps2=5.0,
+        gain_along=6.0,
+        gain_turn=7.0,
+    )
+    np.testing.assert_allclose(part.covariance(model), np.diag(variances))
+
+
+def test_a_targets_noise_is_that_which_drives_its_model() -> None:
+    control = ControlPart(speed_mps=0.2, altitude_m=1.5)
+    noise = ControlNoisePart(speed_mps=0.1, yaw_rate_radps=0.2, altitude_m=0.3, acceleration_mps2=0.4, jerk_mps3=0.5)
+
+    def sigma(model: str) -> tuple[float, ...]:
+        return target_motion(model, control, noise, 1.0, 2.0).noise_sigma
+
+    assert sigma("unicycle") == sigma("quadrotor") == (0.1, 0.2)
+    assert sigma("damped_velocity") == (0.4, 0.4)
+    assert sigma("damped_velocity_3d") == (0.4, 0.4, 0.4)
+    assert sigma("constant_acceleration") == (0.5, 0.5)
+    assert target_motion("quadrotor", control, noise, 1.0, 2.0).held == HeldAltitude(1.5, 0.3)
+    assert target_motion("unicycle", control, noise, 1.0, 2.0).held is None
+
+
 # --- mistakes ---------------------------------------------------------------------------------------------
 
 INITIAL = {"mean": [1.0, 2.0, 0.5], "start_sigma": {"position_m": 0.5, "heading_rad": 0.1}}
@@ -129,6 +208,22 @@ MISTAKES: list[tuple[dict[str, Any], list[str]]] = [
     (
         {"targets": [TARGET | {"start_sigma": {"position": 1.0}}]},
         ["'targets.t1.start_sigma.position'", "did you mean 'position_m'"],
+    ),
+    (
+        {"sensors": {"uwb": {"kind": "range", "mount": [0.1, 0.2, 0.3, 0.4]}}},
+        ["'sensors.uwb.mount'", "x, y, yaw or x, y, z, roll, pitch, yaw"],
+    ),
+    ({"sensors": {"eye": {"kind": "pixel"}}}, ["sensors.eye.intrinsics is missing", "focal_px"]),
+    ({"motion": {"model": "quadrotor"}}, ["motion.altitude_sigma_m", "above 0"]),
+    ({"motion": {"model": "planar_altitude"}}, ["initial.mean needs 4 numbers", "'planar_altitude'"]),
+    (
+        {"motion": {"model": "planar_altitude"}, "initial": INITIAL | {"mean": [1.0, 2.0, 3.0, 0.5]}},
+        ["initial.start_sigma.altitude_m is missing"],
+    ),
+    ({"landmarks": [{"id": "L3", "position": [4.0]}]}, ["'landmarks.L3.position'", "at least 2"]),
+    (
+        {"targets": [TARGET | {"model": "quadrotor", "start_sigma": INITIAL["start_sigma"] | {"altitude_m": 1.0}}]},
+        ["altitude_m above 0"],
     ),
     ({"initial": INITIAL | {"mean": [1.0, 2.0]}}, ["'initial.mean'", "at least 3"]),
     ({"initial": INITIAL | {"mean": [1.0, 2.0, float("nan")]}}, ["'initial.mean.2' = nan"]),

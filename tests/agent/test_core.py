@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from agent.core import Agent
 from agent.effects import Send
-from agent.estimation.motion import LAYOUTS, TargetMotion, split_increment
+from agent.estimation.motion import LAYOUTS, SpatialMotion, TargetMotion, split_increment
 from agent.events import Event, Fix, Observation, Odometry, Tick
 from agent.recording import pack
 from agent.settings import NS, AgentSettings, LatenessSettings, LocalizationSettings, TargetSettings
@@ -280,3 +280,84 @@ def test_a_sighting_from_before_the_last_one_is_not_used_twice() -> None:
     np.testing.assert_array_equal(seen.estimate().tracks[0].cov, before)
     twice = fed(tracker(), *drives, sighted(NS, 3 * NS), sighted(2 * NS, 3 * NS))
     assert twice.counters["late.target_dropped"] == 1
+
+
+# --- with an altitude --------------------------------------------------------------------------------------
+
+
+def drone(altitude_m: float = 10.0) -> Agent:
+    return Agent(
+        replace(
+            agent().settings,
+            mean=np.array([1.0, 2.0, altitude_m, 0.4]),
+            cov=np.diag([0.3, 0.2, 0.1, 0.05]),
+            motion=SpatialMotion(),
+            landmarks={"L1": (2.0, 2.5), "high": (5.0, 1.0, 30.0)},
+        )
+    )
+
+
+def fix(kind: str, *z: float) -> Fix:
+    return Fix(NS, NS, kind, np.array(z), np.eye(len(z)) * 0.01, "nav")
+
+
+def seen_from_above(of: str, attitude: tuple[float, float] = (0.0, 0.0)) -> Observation:
+    down = (0.0, 0.0, 0.0, 0.0, np.pi / 2, 0.0)
+    return Observation(NS, NS, "pixel", of, np.array([0.05, 0.0]), np.eye(2) * 1e-4, "camera", down, attitude)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"), [("position", 2), ("position", 3), ("pose", 3), ("pose", 4), ("altitude", 1)]
+)
+def test_a_drone_uses_what_a_fix_says_of_its_state(kind: str, size: int) -> None:
+    z = {"position": [1.5, 2.5, 11.0], "pose": [1.5, 2.5, 11.0, 0.5], "altitude": [11.0]}[kind]
+    z = [1.5, 2.5, 0.5] if (kind, size) == ("pose", 3) else z[:size]
+    subject = fed(drone(), odometry(0, NS, dx=0.0), fix(kind, *z))
+    assert subject.counters[f"used.{kind}"] == 1
+    mean = subject.estimate().mean
+    assert (mean[2] > 10.5) == (11.0 in z)
+    assert (mean[0] > 1.3) == (1.5 in z)
+
+
+def test_a_rover_leaves_out_the_altitude_of_a_fix() -> None:
+    flat = fed(agent(), odometry(0, NS), fix("position", 1.5, 2.5))
+    high = fed(agent(), odometry(0, NS), fix("position", 1.5, 2.5, 80.0))
+    assert_same_belief(flat, high, 1e-12)
+    assert_same_belief(
+        fed(agent(), odometry(0, NS), fix("pose", 1.5, 2.5, 0.5)),
+        fed(agent(), odometry(0, NS), fix("pose", 1.5, 2.5, 80.0, 0.5)),
+        1e-12,
+    )
+    alone = fed(agent(), odometry(0, NS), fix("altitude", 80.0))
+    assert alone.counters["fix.unused_kind"] == 1
+
+
+def test_a_pixel_of_what_is_behind_the_camera_is_refused_and_counted() -> None:
+    below = fed(drone(), odometry(0, NS), seen_from_above("landmark:L1"))
+    assert below.counters["used.landmark_pixel"] == 1
+    above = fed(drone(), odometry(0, NS), seen_from_above("landmark:high"))
+    assert above.counters["observation.out_of_view"] == 1
+    assert above.counters["update.failed"] == 0
+    assert_same_belief(above, fed(drone(), odometry(0, NS)), 1e-15)
+
+
+def test_the_attitude_of_the_body_counts() -> None:
+    level = fed(drone(), odometry(0, NS), seen_from_above("landmark:L1"))
+    tilted = fed(drone(), odometry(0, NS), seen_from_above("landmark:L1", (0.0, 0.1)))
+    shift = tilted.estimate().mean[:2] - level.estimate().mean[:2]
+    heading = level.estimate().mean[3]
+    # With the nose down the same pixel is of what lies further back, so the robot is further ahead.
+    assert shift @ [np.cos(heading), np.sin(heading)] > 0.3
+
+
+def test_a_peer_is_told_of_a_level_camera() -> None:
+    (effect,) = [
+        item
+        for item in drone().handle(replace(seen_from_above("r2", (0.1, 0.2)), t_ns=0, t_meas_ns=0))
+        if isinstance(item, Send)
+    ]
+    assert isinstance(effect.body, PairRequest)
+    (measurement,) = effect.body.measurements
+    assert measurement.kind == "pixel"
+    assert measurement.mount != seen_from_above("r2").mount
+    assert effect.body.snapshot.belief.model == "spatial"

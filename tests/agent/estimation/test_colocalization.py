@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -22,7 +23,7 @@ from agent.estimation.colocalization import (
 )
 from agent.estimation.gaussian import is_positive_definite, wrap
 from agent.estimation.intersection import Weight
-from agent.estimation.motion import UNICYCLE
+from agent.estimation.motion import SPATIAL, UNICYCLE
 from agent.estimation.observation import AbsoluteModel, RelativeModel, planar_mount
 from agent.estimation.unscented import DEFAULT, Transform
 from network.messages import NEVER, Belief, Epoch, Line, Measurement, Snapshot
@@ -267,6 +268,42 @@ def test_a_contact_applied_by_both_is_the_joint_update(transform: Transform, ini
     assert np.allclose(sides[1].cov, whole.cov[3:, 3:], atol=1e-9)
     assert np.allclose(found.cross_after, whole.cov[:3, 3:], atol=1e-9)
     assert found.nis == pytest.approx(whole.nis)
+
+
+@pytest.mark.parametrize("transform", TRANSFORMS)
+@pytest.mark.parametrize("initiator_is_low", [True, False])
+def test_a_drone_and_a_rover_meet_as_in_their_joint_belief(transform: Transform, initiator_is_low: bool) -> None:
+    rng = np.random.default_rng(62)
+    root = rng.normal(size=(7, 7))
+    joint = (root @ root.T + 0.2 * np.eye(7)) * 0.02
+    drone_mean, rover_mean = np.array([0.0, 0.0, 9.0, 0.3]), np.array([5.0, 2.0, -1.0])
+    drone = Snapshot(Belief("spatial", drone_mean, joint[:4, :4]), NEW, joint[:4, 4:], np.eye(4))
+    rover = Snapshot(Belief("unicycle", rover_mean, joint[4:, 4:]), NEW, joint[4:, :4], np.eye(3))
+    if not initiator_is_low:
+        drone = dataclasses.replace(drone, factor=np.eye(4))
+        rover = dataclasses.replace(rover, factor=joint[4:, :4])
+    down = (0.1, 0.0, -0.05, 0.0, 1.4, 0.2)
+    items = [
+        Measurement("range", np.array([10.6]), np.array([[0.01]]), down),
+        Measurement("pixel", np.array([-0.1, -0.6]), np.eye(2) * 1e-4, down),
+        Measurement("bearing3", np.array([0.1, -0.4]), np.eye(2) * 1e-3, down),
+    ]
+    found = contact(drone, rover, initiator_is_low, items, True, options(transform))
+    models = [RelativeModel(item.kind, SPATIAL, item.mount) for item in items]
+    both = type(UNICYCLE)("drone and rover", 7, (3, 6), 3)
+    z, R = np.concatenate([item.z for item in items]), np.diag([0.01, 1e-4, 1e-4, 1e-3, 1e-3])
+    state = np.concatenate([drone_mean, rover_mean])
+    whole = absolute_update(state, joint, both, StackedModel(models, [1, 2, 2]), z, R, options(transform))  # type: ignore[arg-type]
+    assert whole is not None
+    sides = []
+    for told_of, layout, C in ((drone, SPATIAL, found.C_i), (rover, UNICYCLE, found.C_j)):
+        side = pair_update(told_of.belief.mean, told_of.belief.cov, layout, np.eye(layout.dim), C, found)
+        assert side is not None
+        sides.append(side)
+    assert np.allclose(np.concatenate([side.mean for side in sides]), whole.mean, atol=1e-9)
+    assert np.allclose(sides[0].cov, whole.cov[:4, :4], atol=1e-9)
+    assert np.allclose(sides[1].cov, whole.cov[4:, 4:], atol=1e-9)
+    assert np.allclose(found.cross_after, whole.cov[:4, 4:], atol=1e-9)
 
 
 TWO = type(UNICYCLE)("two robots", 6, (2, 5), 2)
