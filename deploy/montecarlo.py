@@ -210,7 +210,6 @@ def _conclude(
 
 def _compare(top: Path, planned: list[Series], summaries: dict[str, dict[str, Any]], *, quiet: bool) -> None:
     from sim.comparison import write_comparison
-
     from sim.plots import ReportUnavailable
 
     runs = [(series.name, series.run_dir) for series in planned if series.name in summaries]
