@@ -21,7 +21,7 @@ run: setup
 test: check unit
 
 check: setup
-	$(BIN)/ruff check .
+	$(BIN)/ruff check --no-cache .
 	$(BIN)/mypy
 	$(BIN)/mypy --strict examples
 	$(BIN)/mypy benchmarks

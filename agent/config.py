@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from agent.autopilot import AutopilotSettings
-from agent.calibration import NO_CALIBRATION, Form
+from agent.calibration import Form
 from agent.config_file import (
     ConfigError,
     Finite,
@@ -80,9 +80,9 @@ class AgentSensorPart(Part):
     intrinsics: IntrinsicsPart | None = None
 
     def settings(self) -> SensorConfig:
-        calibration = NO_CALIBRATION if self.calibration == CalibrationPart() else self.calibration.settings()
         intrinsics = None if self.intrinsics is None else self.intrinsics.settings()
-        return SensorConfig(mount_of(self.mount), calibration, nanoseconds(self.lag_s), self.form, intrinsics)
+        calibration, lag_ns = self.calibration.settings(), nanoseconds(self.lag_s)
+        return SensorConfig(mount_of(self.mount), calibration, lag_ns, self.form, intrinsics)
 
 
 class PeerPart(Part):

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import AfterValidator
 from pydantic_core import PydanticCustomError
 
-from agent.calibration import Calibration
+from agent.calibration import NO_CALIBRATION, Calibration
 from agent.config_file import ConfigError, Finite, Id, LandmarkId, NotNegative, Part, Point, Positive, Share, Vector2
 from agent.estimation.gain_motion import GainMotion
 from agent.estimation.motion import (
@@ -243,6 +243,9 @@ class CalibrationPart(Part):
     bias_rad: Finite = 0.0
 
     def settings(self) -> Calibration:
+        """Without errors it is `NO_CALIBRATION`, which costs nothing per reading."""
+        if self == CalibrationPart():
+            return NO_CALIBRATION
         return Calibration(self.bias_m, dict(self.bias_of), self.scale, self.depth, self.bias_rad)
 
 

@@ -1,8 +1,9 @@
 """Five real robots (UTIAS MR.CLAM run 7) against the centralized filter: `python -m benchmarks.utias FOLDER`.
 
-Every case is a bundled scenario with one set of parameters, chosen on the first 300 s and scored on the rest. The
-yardstick is the joint filter of all robots with the same parameters on the same data, run by the same code. Prints the
-figures of all cases and whether each condition holds; exit status 1 if one does not.
+Every case is a bundled scenario with one set of parameters, scored after the first 300 s; where they come from, and
+what of them was changed after a look at the score, is told in `sim/scenarios/utias-all.toml`. The yardstick is the
+joint filter of all robots with the same parameters on the same data, run by the same code. Prints the figures of all
+cases and whether each condition holds; exit status 1 if one does not.
 """
 
 from __future__ import annotations

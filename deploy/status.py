@@ -6,7 +6,7 @@ import sys
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console
 from rich.live import Live
@@ -27,7 +27,22 @@ LIVE_TEXT = ("agent", "process", "neighbours")
 LIVE_NUMBERS = ("x [m]", "y [m]", "sigma [m]", "contacts", "rejected", "lag [s]")
 
 
-class Progress:
+class Shown:
+    """A bar that is on the screen within a `with`."""
+
+    _bar: Bar
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+
+class Progress(Shown):
     """A bar with the time left, on standard error; `quiet` shows nothing."""
 
     def __init__(self, title: str, quiet: bool) -> None:
@@ -45,17 +60,8 @@ class Progress:
     def update(self, done: int, total: int) -> None:
         self._bar.update(self._task, completed=done, total=total)
 
-    def __enter__(self) -> Progress:
-        self._bar.start()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bar.stop()
-
-
-class TrialProgress:
+class TrialProgress(Shown):
     """Trials done, lost and failed, speed and time left, on standard error: a bar in a terminal, else some lines."""
 
     LINE_S = 30.0
@@ -105,15 +111,6 @@ class TrialProgress:
         if self._ends_s is not None:
             parts.append(f"{duration(self._ends_s - time.monotonic())} left")
         return ", ".join(parts)
-
-    def __enter__(self) -> TrialProgress:
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bar.stop()
 
 
 class _Told(ProgressColumn):

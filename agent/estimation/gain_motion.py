@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import square_root, wrap, wrap_components
-from agent.estimation.motion import PLANAR, UNICYCLE_GAINS, RobotMotion, StateLayout, compose
-from agent.estimation.unscented import DEFAULT, Propagated, Transform, UnscentedParameters, propagate
+from agent.estimation.gaussian import wrap
+from agent.estimation.motion import PLANAR, UNICYCLE_GAINS, RobotMotion, StateLayout, compose, moved_on, noise_root
+from agent.estimation.unscented import DEFAULT, Propagated, Transform, UnscentedParameters
 
 Array = NDArray[np.float64]
 
@@ -82,20 +82,14 @@ class GainMotion(RobotMotion):
         if transform == "jacobian":
             moved, F, G = _linearized(mean, increment)
             return Propagated(moved, F @ cov @ F.T + G @ noise @ G.T + walked, F)
-        active = np.flatnonzero(np.diagonal(noise) > 0.0)
-        root = np.zeros((3, len(active)))
-        if len(active):
-            root[active] = square_root(noise[np.ix_(active, active)])
 
         def move(points: Array, noises: Array) -> Array:
             image = points.copy()
             image[..., :3] = compose(points[..., :3], scaled(points, increment) + noises)
             return image
 
-        # Headings are added up, never wrapped, on the way: a wrapped deviation of a point that lies half a turn off
-        # would make a heading that is nearly unknown look like a known one.
-        found = propagate(move, mean, cov, root, (), parameters)
-        return Propagated(wrap_components(found.mean, self.layout.angles), found.cov + walked, found.F)
+        found = moved_on(move, mean, cov, noise_root(noise), self.layout, parameters)
+        return Propagated(found.mean, found.cov + walked, found.F)
 
 
 def _linearized(mean: Array, increment: Array) -> tuple[Array, Array, Array]:

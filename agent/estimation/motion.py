@@ -8,12 +8,13 @@ are no states: odometry increments are of the levelled body.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import square_root, wrap
+from agent.estimation.gaussian import square_root, wrap, wrap_components
 from agent.estimation.unscented import DEFAULT, Propagated, Transform, UnscentedParameters, propagate
 
 Array = NDArray[np.float64]
@@ -101,6 +102,32 @@ def split_increment(delta: Array, cov: Array, fraction: float) -> tuple[Array, A
     return first, cov * fraction, second, cov * (1.0 - fraction)
 
 
+def noise_root(noise: Array) -> Array:
+    """Square root (n, r) of a covariance (n, n), of the directions that have noise."""
+    active = np.flatnonzero(np.diagonal(noise) > 0.0)
+    root = np.zeros((len(noise), len(active)))
+    if len(active):
+        root[active] = square_root(noise[np.ix_(active, active)])
+    return root
+
+
+def moved_on(
+    function: Callable[[Array, Array], Array],
+    mean: Array,
+    cov: Array,
+    root: Array,
+    layout: StateLayout,
+    parameters: UnscentedParameters,
+) -> Propagated:
+    """Unscented propagation of a state by a `function` that adds to its heading and does not wrap it.
+
+    Headings are added up, never wrapped, on the way: a wrapped deviation of a point that lies half a turn off would
+    make a heading that is nearly unknown look like a known one.
+    """
+    found = propagate(function, mean, cov, root, (), parameters)
+    return Propagated(wrap_components(found.mean, layout.angles), found.cov, found.F)
+
+
 def advance(
     mean: Array,
     cov: Array,
@@ -123,15 +150,12 @@ def advance(
         G = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         moved[2] = wrap(moved[2])
         return Propagated(moved, F @ cov @ F.T + G @ noise @ G.T, F)
-    active = np.flatnonzero(np.diagonal(noise) > 0.0)
-    root = np.zeros((3, len(active)))
-    if len(active):
-        root[active] = square_root(noise[np.ix_(active, active)])
+    root = noise_root(noise)
 
     def move(points: Array, noises: Array) -> Array:
         return compose(points, increment + noises)
 
-    return propagate(move, mean, cov, root, UNICYCLE.angles, parameters)
+    return moved_on(move, mean, cov, root, UNICYCLE, parameters)
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,10 +195,7 @@ def advance_spatial(
         if held is not None:
             moved[2], F[2, 2] = held.altitude_m, 0.0
         return Propagated(moved, F @ cov @ F.T + G @ noise @ G.T, F)
-    active = np.flatnonzero(np.diagonal(noise) > 0.0)
-    root = np.zeros((4, len(active)))
-    if len(active):
-        root[active] = square_root(noise[np.ix_(active, active)])
+    root = noise_root(noise)
 
     def move(points: Array, noises: Array) -> Array:
         steps = delta + noises
@@ -183,7 +204,7 @@ def advance_spatial(
         image[..., 2] = points[..., 2] + steps[..., 2] if held is None else held.altitude_m + noises[..., 2]
         return image
 
-    return propagate(move, mean, cov, root, SPATIAL.angles, parameters)
+    return moved_on(move, mean, cov, root, SPATIAL, parameters)
 
 
 @dataclass(frozen=True, slots=True)

@@ -374,3 +374,17 @@ def test_each_axis_is_driven_by_its_own_noise(layout: StateLayout) -> None:
         assert np.allclose(drifted.cov[np.ix_(own, own)], 0.5 * one**2 * Q[np.ix_(own, own)], rtol=1e-6, atol=1e-10)
         others = np.setdiff1d(np.arange(6), own)
         assert np.allclose(drifted.cov[np.ix_(own, others)], 0.0)
+
+
+@pytest.mark.parametrize("layout", [UNICYCLE, SPATIAL])
+@pytest.mark.parametrize("sigma", [0.5, 2.0, 4.0])
+def test_a_heading_nobody_knows_is_not_made_known_by_moving(layout: StateLayout, sigma: float) -> None:
+    """Deviations beyond half a turn are deviations still: wrapped, they would shrink the variance."""
+    heading, turned = layout.dim - 1, 0.2
+    cov = np.diag([0.1] * heading + [sigma**2])
+    noise = np.diag([1e-4, 1e-4, 1e-4, 1e-2])
+    move = advance if layout is UNICYCLE else advance_spatial
+    moved = move(np.zeros(layout.dim), cov, np.array([0.1, 0.0, 0.0, turned]), noise, "unscented")
+    assert moved.cov[heading, heading] == pytest.approx(sigma**2 + 1e-2)
+    assert moved.mean[heading] == pytest.approx(turned)
+    assert moved.F[heading, heading] == pytest.approx(1.0)

@@ -50,6 +50,16 @@ def test_the_bound_holds_for_every_correlation_of_the_shared_errors(seed: int, n
     assert found.cost < n
 
 
+def test_the_bound_is_put_to_the_test() -> None:
+    """Most random beliefs gain by an update, so the property above is not about nothing."""
+    gained = 0
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        H_own, H_other = rng.normal(size=(2, 3)), rng.normal(size=(2, 3))
+        gained += update_from_peer(random_split(rng, 3), random_split(rng, 3), H_own, H_other, np.eye(2)) is not None
+    assert gained >= 25
+
+
 def test_without_shared_errors_it_is_the_kalman_update() -> None:
     rng = np.random.default_rng(3)
     own, other = random_psd(rng, 3, 3), random_psd(rng, 3, 3)
