@@ -47,9 +47,7 @@ def moved(
     """State and targets predicted to `t_ns` with an odometry increment; returns (state, F (n, n))."""
     localization = settings.localization
     dt_s = (t_ns - state.t_ns) * 1e-9
-    own = settings.motion.advance(
-        state.mean, state.cov, delta, cov, dt_s, localization.transform, localization.parameters
-    )
+    own = settings.motion.advance(state.mean, state.cov, delta, cov, dt_s, localization.transform)
     targets = {}
     for target in settings.targets:
         belief = state.targets.get(target.id)
@@ -120,7 +118,7 @@ class History:
         localization = self._settings.localization
         rest_s = (self._stamps[index + 1] - t_ns) * 1e-9
         rest = self._settings.motion.advance(
-            state.mean, state.cov, second, second_cov, rest_s, localization.transform, localization.parameters
+            state.mean, state.cov, second, second_cov, rest_s, localization.transform
         )
         following.delta, following.delta_cov, following.F = second, second_cov, rest.F
         self._entries.insert(index + 1, Entry(state, first, first_cov, F, np.eye(len(state.mean))))

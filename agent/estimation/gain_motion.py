@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian import wrap
-from agent.estimation.motion import PLANAR, UNICYCLE_GAINS, RobotMotion, StateLayout, compose, moved_on, noise_root
-from agent.estimation.unscented import DEFAULT, Propagated, Transform, UnscentedParameters
+from agent.estimation.heading_moments import moved_in_its_frame
+from agent.estimation.motion import PLANAR, UNICYCLE_GAINS, RobotMotion, StateLayout
+from agent.estimation.unscented import Propagated, Transform
 
 Array = NDArray[np.float64]
 
@@ -73,7 +74,6 @@ class GainMotion(RobotMotion):
         delta_cov: Array,
         dt_s: float,
         transform: Transform,
-        parameters: UnscentedParameters = DEFAULT,
     ) -> Propagated:
         increment = delta[[0, 1, 3]]
         noise = delta_cov[np.ix_(PLANAR, PLANAR)]
@@ -82,13 +82,7 @@ class GainMotion(RobotMotion):
         if transform == "jacobian":
             moved, F, G = _linearized(mean, increment)
             return Propagated(moved, F @ cov @ F.T + G @ noise @ G.T + walked, F)
-
-        def move(points: Array, noises: Array) -> Array:
-            image = points.copy()
-            image[..., :3] = compose(points[..., :3], scaled(points, increment) + noises)
-            return image
-
-        found = moved_on(move, mean, cov, noise_root(noise), self.layout, parameters)
+        found = moved_in_its_frame(mean, cov, increment, noise, UNICYCLE_GAINS.angles[0], (ALONG, TURN))
         return Propagated(found.mean, found.cov + walked, found.F)
 
 

@@ -8,14 +8,14 @@ are no states: odometry increments are of the levelled body.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import square_root, wrap, wrap_components
-from agent.estimation.unscented import DEFAULT, Propagated, Transform, UnscentedParameters, propagate
+from agent.estimation.gaussian import wrap
+from agent.estimation.heading_moments import moved_in_its_frame
+from agent.estimation.unscented import Propagated, Transform
 
 Array = NDArray[np.float64]
 
@@ -102,39 +102,12 @@ def split_increment(delta: Array, cov: Array, fraction: float) -> tuple[Array, A
     return first, cov * fraction, second, cov * (1.0 - fraction)
 
 
-def noise_root(noise: Array) -> Array:
-    """Square root (n, r) of a covariance (n, n), of the directions that have noise."""
-    active = np.flatnonzero(np.diagonal(noise) > 0.0)
-    root = np.zeros((len(noise), len(active)))
-    if len(active):
-        root[active] = square_root(noise[np.ix_(active, active)])
-    return root
-
-
-def moved_on(
-    function: Callable[[Array, Array], Array],
-    mean: Array,
-    cov: Array,
-    root: Array,
-    layout: StateLayout,
-    parameters: UnscentedParameters,
-) -> Propagated:
-    """Unscented propagation of a state by a `function` that adds to its heading and does not wrap it.
-
-    Headings are added up, never wrapped, on the way: a wrapped deviation of a point that lies half a turn off would
-    make a heading that is nearly unknown look like a known one.
-    """
-    found = propagate(function, mean, cov, root, (), parameters)
-    return Propagated(wrap_components(found.mean, layout.angles), found.cov, found.F)
-
-
 def advance(
     mean: Array,
     cov: Array,
     delta: Array,
     delta_cov: Array,
     transform: Transform,
-    parameters: UnscentedParameters = DEFAULT,
 ) -> Propagated:
     """Move a unicycle belief (3,), (3, 3) by an odometry increment (4,) with covariance (4, 4).
 
@@ -150,12 +123,7 @@ def advance(
         G = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         moved[2] = wrap(moved[2])
         return Propagated(moved, F @ cov @ F.T + G @ noise @ G.T, F)
-    root = noise_root(noise)
-
-    def move(points: Array, noises: Array) -> Array:
-        return compose(points, increment + noises)
-
-    return moved_on(move, mean, cov, root, UNICYCLE, parameters)
+    return moved_in_its_frame(mean, cov, increment, noise, 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +140,6 @@ def advance_spatial(
     delta: Array,
     delta_cov: Array,
     transform: Transform,
-    parameters: UnscentedParameters = DEFAULT,
     held: HeldAltitude | None = None,
 ) -> Propagated:
     """Move a belief of x, y, z, heading (4,), (4, 4) by an odometry increment (4,) with covariance (4, 4).
@@ -180,11 +147,6 @@ def advance_spatial(
     The altitude is that before plus the increment's; with `held` it is the held one instead, z' = z_c + w, of which
     the past tells nothing: F has a zero row (UT-CLAT eq. 33).
     """
-    noise = delta_cov
-    if held is not None:
-        noise = delta_cov.copy()
-        noise[2, :] = noise[:, 2] = 0.0
-        noise[2, 2] = held.sigma_m**2
     if transform == "jacobian":
         pose = compose(mean[[0, 1, 3]], delta[[0, 1, 3]])
         moved = np.array([pose[0], pose[1], mean[2] + delta[2], wrap(pose[2])])
@@ -192,19 +154,15 @@ def advance_spatial(
         F[0, 3], F[1, 3] = mean[1] - moved[1], moved[0] - mean[0]
         cos, sin = np.cos(mean[3]), np.sin(mean[3])
         G[:2, :2] = [[cos, -sin], [sin, cos]]
-        if held is not None:
-            moved[2], F[2, 2] = held.altitude_m, 0.0
-        return Propagated(moved, F @ cov @ F.T + G @ noise @ G.T, F)
-    root = noise_root(noise)
-
-    def move(points: Array, noises: Array) -> Array:
-        steps = delta + noises
-        image = np.empty(steps.shape)
-        image[..., [0, 1, 3]] = compose(points[..., [0, 1, 3]], steps[..., [0, 1, 3]])
-        image[..., 2] = points[..., 2] + steps[..., 2] if held is None else held.altitude_m + noises[..., 2]
-        return image
-
-    return moved_on(move, mean, cov, root, SPATIAL, parameters)
+        found = Propagated(moved, F @ cov @ F.T + G @ delta_cov @ G.T, F)
+    else:
+        found = moved_in_its_frame(mean, cov, delta, delta_cov, 3)
+    if held is not None:
+        found.mean[2] = held.altitude_m
+        found.F[2, :] = 0.0
+        found.cov[2, :] = found.cov[:, 2] = 0.0
+        found.cov[2, 2] = held.sigma_m**2
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,10 +179,9 @@ class RobotMotion:
         delta_cov: Array,
         dt_s: float,
         transform: Transform,
-        parameters: UnscentedParameters = DEFAULT,
-    ) -> Propagated:
+        ) -> Propagated:
         """Belief (n,), (n, n) after an odometry increment (4,) with covariance (4, 4) over `dt_s` > 0 seconds."""
-        return advance(mean, cov, delta, delta_cov, transform, parameters)
+        return advance(mean, cov, delta, delta_cov, transform)
 
 
 PLANAR_MOTION = RobotMotion()
@@ -245,9 +202,8 @@ class SpatialMotion(RobotMotion):
         delta_cov: Array,
         dt_s: float,
         transform: Transform,
-        parameters: UnscentedParameters = DEFAULT,
-    ) -> Propagated:
-        return advance_spatial(mean, cov, delta, delta_cov, transform, parameters, self.held)
+        ) -> Propagated:
+        return advance_spatial(mean, cov, delta, delta_cov, transform, self.held)
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,7 +225,6 @@ class TargetMotion:
     noise_sigma: tuple[float, ...] = (0.1, 0.1)
     noise_step_s: float = 1.0
     damping_s: float = 2.0
-    parameters: UnscentedParameters = field(default=DEFAULT)
     held: HeldAltitude | None = None
 
     def drift(self, mean: Array, cov: Array, dt_s: float, transform: Transform) -> Propagated:
@@ -281,8 +236,8 @@ class TargetMotion:
         delta = np.array([speed, 0.0, 0.0, turn])
         noise = np.diag([(self.noise_sigma[0] * scale) ** 2, 0.0, 0.0, (self.noise_sigma[1] * scale) ** 2])
         if self.layout is SPATIAL:
-            return advance_spatial(mean, cov, delta, noise, transform, self.parameters, self.held)
-        return advance(mean, cov, delta, noise, transform, self.parameters)
+            return advance_spatial(mean, cov, delta, noise, transform, self.held)
+        return advance(mean, cov, delta, noise, transform)
 
     def _drift_velocity(self, mean: Array, cov: Array, dt: float) -> Propagated:
         F, Q = velocity_step(self.layout, dt, self.damping_s)

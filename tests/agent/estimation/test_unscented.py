@@ -19,10 +19,10 @@ from agent.estimation.unscented import (
     Transform,
     UnscentedParameters,
     observe,
-    propagate,
     sigma_points,
     weights,
 )
+from tests.agent.estimation.sigma_points import propagate
 
 Array = NDArray[np.float64]
 

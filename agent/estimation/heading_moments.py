@@ -1,0 +1,87 @@
+"""Mean and covariance of a pose moved in its own frame, exact for a Gaussian belief however wide its heading is.
+
+A body increment u = dx + i dy moves a position by u g e^(i phi), with g = 1 and phi the heading, or with a gain g and a
+heading phi that leans on a gain of turning. For jointly Gaussian g and phi the characteristic function gives
+(C = cov(g, phi), V = var(g), s^2 = var(phi), means g0, phi0)
+
+    E[g e^(i phi)]      = (g0 + i C) e^(i phi0 - s^2/2)
+    E[g^2 e^(2 i phi)]  = ((g0 + 2 i C)^2 + V) e^(2 i phi0 - 2 s^2)
+    E[g^2]              = g0^2 + V
+
+and the covariance with the state is P times the expected gradient (Stein's lemma), which makes F the statistical
+linearization. This is what an unscented prediction (UT-CLAT eq. 9-12) approximates. Sigma points of a heading that is
+wider than about a radian lie turns apart and alias: covariances of the position shrink that should grow.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.estimation.gaussian import symmetrize, wrap
+from agent.estimation.unscented import Propagated
+
+Array = NDArray[np.float64]
+
+
+def moved_in_its_frame(
+    mean: Array, cov: Array, delta: Array, noise: Array, heading: int, gains: tuple[int, int] | None = None
+) -> Propagated:
+    """Belief (n,), (n, n) of a state x, y, ... after a body increment, with noise in the body frame at its beginning.
+
+    delta (k,) and noise (k, k) are of the increment's dx, dy, [dz,] dyaw, dz being of the third component. `heading`
+    says where the heading sits, `gains` the gains of forward motion and of turning: the chord then leans by half of
+    what the turn is longer. The mean's heading is wrapped.
+    """
+    n, dyaw, u = len(mean), float(delta[-1]), complex(delta[0], delta[1])
+    lean, scale, V, C = np.zeros(n), 1.0, 0.0, 0.0
+    lean[heading] = 1.0
+    phi, turned = float(mean[heading]), dyaw
+    if gains is not None:
+        along, turn = gains
+        lean[turn] = 0.5 * dyaw
+        phi += 0.5 * dyaw * (float(mean[turn]) - 1.0)
+        scale, turned = float(mean[along]), dyaw * float(mean[turn])
+        V, C = float(cov[along, along]), float(cov[along] @ lean)
+    s2 = float(lean @ cov @ lean)
+    direction = np.exp(1j * phi - 0.5 * s2)
+    first = (scale + 1j * C) * direction
+
+    moved, F = mean.copy(), np.eye(n)
+    step = u * first
+    moved[:2] += (step.real, step.imag)
+    moved[heading] = wrap(moved[heading] + turned)
+    gradient = 1j * step * lean
+    if gains is not None:
+        gradient[along] += u * direction
+        F[heading, turn] = dyaw
+    F[0] += gradient.real
+    F[1] += gradient.imag
+    new = F @ cov @ F.T
+    # What the step's own spread has beyond its part that is linear in the state.
+    spread = abs(u) ** 2 * (scale**2 + V) - abs(step) ** 2
+    pseudo = u**2 * ((scale + 2j * C) ** 2 + V) * np.exp(2j * phi - 2.0 * s2) - step**2
+    linear = np.array([gradient.real, gradient.imag])
+    new[:2, :2] += _real(spread, pseudo) - linear @ cov @ linear.T
+
+    width = float(cov[heading, heading])
+    body = np.exp(1j * mean[heading] - 0.5 * width)
+    pseudo = (noise[0, 0] - noise[1, 1] + 2j * noise[0, 1]) * np.exp(2j * mean[heading] - 2.0 * width)
+    new[:2, :2] += _real(noise[0, 0] + noise[1, 1], pseudo)
+    others = [heading] if len(delta) == 3 else [2, heading]
+    for row, other in enumerate(others, start=2):
+        across = body * complex(noise[0, row], noise[1, row])
+        new[0, other] += across.real
+        new[1, other] += across.imag
+        new[other, :2] = new[:2, other]
+        for column, another in enumerate(others, start=2):
+            new[other, another] += noise[row, column]
+    if len(delta) == 4:
+        moved[2] += delta[2]
+    return Propagated(moved, symmetrize(new), F)
+
+
+def _real(spread: float, pseudo: complex) -> Array:
+    """Covariance (2, 2) of real and imaginary part, from E|z|^2 and E z^2 of a complex number of mean zero."""
+    half = 0.5 * pseudo.imag
+    return np.array([[0.5 * (spread + pseudo.real), half], [half, 0.5 * (spread - pseudo.real)]])
