@@ -62,6 +62,10 @@ class CooperativeFilter(Protocol):
         """A peer has answered."""
         ...
 
+    def heard(self, event: Received, effects: list[Effect]) -> None:
+        """A peer has told something to everybody (a body that travels on the channel `belief`)."""
+        ...
+
     def link_changed(self, event: LinkChange) -> None:
         """A peer appeared, fell silent or began a new life."""
         ...

@@ -18,7 +18,7 @@ from agent.cooperative_filter import CooperativeFilter
 from agent.effects import Effect, Estimate, Publish
 from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError, absolute_model, relative_model, told
 from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received, Tick
-from agent.factor_filter import FactorFilter
+from agent.forms import build_filter
 from agent.settings import AgentSettings
 from agent.timeline import Item, OdometryTrack, Phase, Timeline
 from network.messages import PairReply, PairRequest
@@ -44,7 +44,7 @@ class Agent:
         self.now_ns = settings.start_ns
         self._timeline = Timeline()
         self._odometry = OdometryTrack(settings.coast, settings.lateness.tolerance_ns, self.counters)
-        self.filter: CooperativeFilter = FactorFilter(settings, self.counters, self._count_nis)
+        self.filter: CooperativeFilter = build_filter(settings, self.counters, self._count_nis)
         self._published: object = None
 
     # -- events ---------------------------------------------------------------------------------------------
@@ -142,7 +142,8 @@ class Agent:
             self._drain(effects)
             self.filter.replied(event.message.header.source, body)
         else:
-            self.counters["received.unused"] += 1
+            self._drain(effects)
+            self.filter.heard(event, effects)
 
     # -- time -----------------------------------------------------------------------------------------------
 

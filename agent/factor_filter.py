@@ -175,6 +175,9 @@ class FactorFilter:
         assert isinstance(body, PairReply)
         self.state = self._pairs.reply(peer, body, self.state, self.history)
 
+    def heard(self, event: Received, effects: list[Effect]) -> None:
+        self._counters["received.unused"] += 1
+
     def link_changed(self, event: LinkChange) -> None:
         self.state = self._pairs.link_changed(event, self.state, self.history)
 

@@ -1,0 +1,17 @@
+"""Which filter a robot runs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+from agent.cooperative_filter import CooperativeFilter
+from agent.factor_filter import FactorFilter
+from agent.settings import AgentSettings
+
+
+def build_filter(
+    settings: AgentSettings, counters: Counter[str], count_nis: Callable[[str, float], None]
+) -> CooperativeFilter:
+    """The filter of `settings.localization`."""
+    return FactorFilter(settings, counters, count_nis)
