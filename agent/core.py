@@ -21,7 +21,7 @@ from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received
 from agent.forms import build_filter
 from agent.settings import AgentSettings
 from agent.timeline import Item, OdometryTrack, Phase, Timeline
-from network.messages import PairReply, PairRequest
+from network.messages import PairReply, PairRequest, SplitReply, SplitRequest
 
 Array = NDArray[np.float64]
 
@@ -136,9 +136,9 @@ class Agent:
 
     def _receive(self, event: Received, effects: list[Effect]) -> None:
         body = event.message.body
-        if isinstance(body, PairRequest):
+        if isinstance(body, PairRequest | SplitRequest):
             self._queue(Item(self.filter.instant_ns(event), Phase.PAIR, event.message.header.source, event))
-        elif isinstance(body, PairReply):
+        elif isinstance(body, PairReply | SplitReply):
             self._drain(effects)
             self.filter.replied(event.message.header.source, body)
         else:

@@ -21,7 +21,7 @@ from agent.events import LinkChange, Observation, Received
 from agent.history import History, moved
 from agent.pairs import Pairs
 from agent.settings import AgentSettings
-from network.messages import Body, Epoch, Measurement, PairReply, PairRequest, Snapshot
+from network.messages import Body, Epoch, Measurement, PairReply, PairRequest, Snapshot, SplitRequest
 
 Array = NDArray[np.float64]
 
@@ -165,14 +165,19 @@ class FactorFilter:
 
     def instant_ns(self, event: Received) -> int:
         body = event.message.body
-        assert isinstance(body, PairRequest)
-        return body.epoch.t_meas_ns - self._pairs.offset_ns(event)
+        assert isinstance(body, PairRequest | SplitRequest)
+        return body.epoch.t_meas_ns - self._pairs.clocks.offset_ns(event)
 
     def requested(self, event: Received, t_ns: int, effects: list[Effect]) -> None:
+        if not isinstance(event.message.body, PairRequest):
+            self._counters["pair.other_form"] += 1
+            return
         self.state = self._pairs.request(event, t_ns, self.state, self.history, effects)
 
     def replied(self, peer: str, body: Body) -> None:
-        assert isinstance(body, PairReply)
+        if not isinstance(body, PairReply):
+            self._counters["pair.other_form"] += 1
+            return
         self.state = self._pairs.reply(peer, body, self.state, self.history)
 
     def heard(self, event: Received, effects: list[Effect]) -> None:

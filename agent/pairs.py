@@ -22,6 +22,7 @@ from agent.estimation.motion import STATES
 from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError
 from agent.events import LinkChange, Received
 from agent.history import History
+from agent.pair_clock import PairClocks
 from agent.pairing import PairExchange, Step
 from agent.settings import AgentSettings
 from network.messages import (
@@ -62,7 +63,7 @@ class Pairs:
         self._exchanges: dict[str, PairExchange] = {}
         self._lives: dict[str, tuple[int, int]] = {}
         self._inflated_ns: dict[str, int] = {}
-        self._clock_sigma_ns: dict[str, int] = {}
+        self.clocks = PairClocks(settings)
         self._motions = {target.id: target.motion for target in settings.targets}
 
     def exchange(self, peer: str) -> PairExchange:
@@ -151,7 +152,7 @@ class Pairs:
         if then is None:
             self._counters["pair.too_old_own"] += 1
             return state, None
-        told = tuple(self._with_clock_noise(peer, item) for item in measurements[:MAX_MEASUREMENTS])
+        told = tuple(self.clocks.widened(peer, item) for item in measurements[:MAX_MEASUREMENTS])
         request = exchange.open(t_ns, now_ns, told, self._fitting(self.snapshot(then, peer), told))
         self._counters["pair.started"] += 1
         return history.opened(then.t_ns, peer, request.epoch), request
@@ -260,37 +261,6 @@ class Pairs:
             and told.line.shape == square
             and all(line.matrix.shape == square for line in told.lines)
         )
-
-    def offset_ns(self, event: Received) -> int:
-        """Clock of the message's sender minus the own one: the measured offset blended with the prior.
-
-        A fleet whose clocks are known to agree (`clock_sigma_ns` = 0) needs no measurement.
-        """
-        prior = self._settings.lateness.clock_sigma_ns
-        sigma = event.offset_sigma_ns
-        if prior == 0 or sigma is None:
-            self._clock_sigma_ns[event.message.header.source] = prior
-            return 0
-        share = prior**2 / (prior**2 + sigma**2)
-        self._clock_sigma_ns[event.message.header.source] = round(share**0.5 * sigma)
-        return round(share * event.offset_ns)
-
-    def _with_clock_noise(self, peer: str, item: Measurement) -> Measurement:
-        """R widened by how far the peer may move within the uncertainty of its clock (coasting speed)."""
-        sigma_s = self._clock_sigma_ns.get(peer, self._settings.lateness.clock_sigma_ns) * 1e-9
-        if sigma_s == 0.0:
-            return item
-        moved = (self._settings.coast.speed_mps * sigma_s) ** 2
-        reach = max(float(item.z[0]), 1.0) if item.kind == "range_bearing" else 1.0
-        extra = {
-            "range": [moved],
-            "bearing": [moved / reach**2],
-            "bearing3": [moved, moved],
-            "pixel": [moved, moved],
-            "range_bearing": [moved, moved / reach**2],
-            "vector": [moved, moved],
-        }
-        return replace(item, R=item.R + np.diag(extra[item.kind]))
 
     def _apply(
         self,

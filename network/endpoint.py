@@ -34,6 +34,8 @@ from network.messages import (
     Packet,
     PairReply,
     PairRequest,
+    SplitReply,
+    SplitRequest,
 )
 from network.peers import Peer, PeerTable
 from network.wire import MAX_INT, OversizeError, WireError, decode, encode, valid_id
@@ -288,6 +290,6 @@ def _belongs(body: Body, channel: str) -> bool:
     """Whether a body of this type may travel on this channel."""
     if isinstance(body, Hello):
         return channel == Channel.HELLO
-    if isinstance(body, PairRequest | PairReply):
+    if isinstance(body, PairRequest | PairReply | SplitRequest | SplitReply):
         return channel == Channel.PAIR
     return channel == Channel.BELIEF

@@ -24,6 +24,9 @@ MAX_LINES = 4
 """Unresolved identity lines a snapshot carries at most; a pair that would need an older one begins anew."""
 
 MAX_STATE_DIM = 8
+MAX_JOINT_DIM = 16
+"""Components of a robot and its targets together in one split belief."""
+
 MAX_TARGETS = 8
 MAX_MEASUREMENTS = 8
 MAX_ECHOES = 16
@@ -181,7 +184,39 @@ class PairReply:
     snapshot: Snapshot | None = None
 
 
-Body = Hello | PairRequest | PairReply
+@dataclass(frozen=True, slots=True, eq=False)
+class SplitSnapshot:
+    """A robot and targets as one belief whose error covariance is split, before a contact's update.
+
+    mean (n,), cov (n, n) over the robot's state followed by those of `targets` (id, model), in order; private (n, n) is
+    the part of cov that stems from noise nobody else holds, None if there is none.
+    """
+
+    model: str
+    targets: tuple[tuple[str, str], ...]
+    mean: Array
+    cov: Array
+    private: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SplitRequest:
+    """A `PairRequest` between robots that keep no correlation factors."""
+
+    epoch: Epoch
+    measurements: tuple[Measurement, ...]
+    snapshot: SplitSnapshot
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SplitReply:
+    """Answers a `SplitRequest` with the peer's snapshot at the same instant."""
+
+    epoch: Epoch
+    snapshot: SplitSnapshot
+
+
+Body = Hello | PairRequest | PairReply | SplitRequest | SplitReply
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from network.messages import (
     MAX_ECHOES,
+    MAX_JOINT_DIM,
     MAX_LINES,
     MAX_MEASUREMENTS,
     MAX_MESSAGE_BYTES,
@@ -39,6 +40,9 @@ from network.messages import (
     PairRequest,
     ReplyStatus,
     Snapshot,
+    SplitReply,
+    SplitRequest,
+    SplitSnapshot,
     TargetBelief,
 )
 
@@ -64,6 +68,9 @@ SENSOR_FLOOR = 1e-10
 BELIEF_FLOOR = 1e-18
 """Smallest conditional variance of a belief that double precision still inverts."""
 
+PART_FLOOR = 1e-9
+"""How far below zero, relative to the largest variance, rounding may take a part of a split covariance."""
+
 REASONS = (
     "malformed",
     "wrong_type",
@@ -80,7 +87,7 @@ REASONS = (
 )
 """Every reason a `WireError` may carry; they are counter names and do not change."""
 
-_HELLO, _PAIR_REQUEST, _PAIR_REPLY = 1, 2, 3
+_HELLO, _PAIR_REQUEST, _PAIR_REPLY, _SPLIT_REQUEST, _SPLIT_REPLY = 1, 2, 3, 4, 5
 _HEADER_BYTES = 3 + 25 + 5 * 9 + 1
 """Upper bound of what surrounds a body: array marks, schema, longest source, five integers, kind."""
 
@@ -90,12 +97,12 @@ _LIMITS: dict[str, Any] = {
     "use_list": False,
     "strict_map_key": True,
     "max_str_len": 48,
-    "max_bin_len": 8 * MAX_STATE_DIM * MAX_STATE_DIM,
+    "max_bin_len": 4 * MAX_JOINT_DIM * (MAX_JOINT_DIM + 1),
     "max_array_len": MAX_ECHOES,
     "max_map_len": 0,
     "max_ext_len": 0,
 }
-_TRIU = {n: np.triu_indices(n) for n in range(1, MAX_STATE_DIM + 1)}
+_TRIU = {n: np.triu_indices(n) for n in range(1, MAX_JOINT_DIM + 1)}
 
 
 def _packed_index(n: int) -> NDArray[np.intp]:
@@ -174,6 +181,11 @@ def _pack_body(body: Body) -> tuple[int, tuple[Any, ...]]:
     if isinstance(body, PairReply):
         snapshot = None if body.snapshot is None else _pack_snapshot(body.snapshot)
         return _PAIR_REPLY, (_pack_epoch(body.epoch), int(body.status), snapshot)
+    if isinstance(body, SplitRequest):
+        measurements = tuple(_pack_measurement(m) for m in body.measurements)
+        return _SPLIT_REQUEST, (_pack_epoch(body.epoch), measurements, _pack_split(body.snapshot))
+    if isinstance(body, SplitReply):
+        return _SPLIT_REPLY, (_pack_epoch(body.epoch), _pack_split(body.snapshot))
     raise TypeError(f"{type(body).__name__} is not a message body")
 
 
@@ -226,6 +238,12 @@ def _pack_snapshot(snapshot: Snapshot) -> tuple[Any, ...]:
         tuple((target.target, *_pack_belief(target.belief)) for target in snapshot.targets),
         snapshot.known,
     )
+
+
+def _pack_split(snapshot: SplitSnapshot) -> tuple[Any, ...]:
+    n = len(snapshot.mean)
+    private = None if snapshot.private is None else _pack_cov(snapshot.private, n)
+    return snapshot.model, snapshot.targets, _pack_array(snapshot.mean, (n,)), _pack_cov(snapshot.cov, n), private
 
 
 # --- decoding ---------------------------------------------------------------------------------------------
@@ -474,9 +492,56 @@ def _pair_reply(raw: Any, header: Header) -> PairReply:
     return PairReply(_contact(epoch), ReplyStatus(status), snapshot)
 
 
+def _dim(model: Any) -> int:
+    dim = MODEL_DIMS.get(_text(model))
+    if dim is None:
+        raise WireError("unknown_model")
+    return dim
+
+
+def _split(raw: Any) -> SplitSnapshot:
+    model, targets_raw, mean, cov_raw, private_raw = _fields(raw, 5)
+    targets = []
+    for item in _items(targets_raw, MAX_TARGETS):
+        name, target_model = _fields(item, 2)
+        targets.append((_identifier(name), _text(target_model)))
+    if len({name for name, _ in targets}) != len(targets):
+        raise WireError("malformed")
+    n = _dim(model) + sum(_dim(target_model) for _, target_model in targets)
+    if n > MAX_JOINT_DIM:
+        raise WireError("out_of_range")
+    cov = _cov(cov_raw, n, BELIEF_FLOOR, "not_positive_definite")
+    private = None
+    if private_raw is not None:
+        private = _array(private_raw, n * (n + 1) // 2)[_FULL[n]]
+        # Neither part may be negative: what is private is within the whole, and what is left is shared.
+        floor = -PART_FLOOR * cov.diagonal().max()
+        if np.linalg.eigvalsh(private)[0] < floor or np.linalg.eigvalsh(cov - private)[0] < floor:
+            raise WireError("not_positive_definite")
+    return SplitSnapshot(model, tuple(targets), _array(mean, n), cov, private)
+
+
+def _split_request(raw: Any, header: Header) -> SplitRequest:
+    epoch_raw, measurements_raw, snapshot = _fields(raw, 3)
+    epoch = _contact(epoch_raw)
+    if epoch.initiator != header.source:
+        raise WireError("source_mismatch")
+    measurements = tuple(_measurement(item) for item in _items(measurements_raw, MAX_MEASUREMENTS))
+    if not measurements:
+        raise WireError("malformed")
+    return SplitRequest(epoch, measurements, _split(snapshot))
+
+
+def _split_reply(raw: Any, header: Header) -> SplitReply:
+    epoch, snapshot = _fields(raw, 2)
+    return SplitReply(_contact(epoch), _split(snapshot))
+
+
 _STATUSES = frozenset(int(status) for status in ReplyStatus)
 _BODIES: dict[int, Callable[[Any, Header], Body]] = {
     _HELLO: _hello,
     _PAIR_REQUEST: _pair_request,
     _PAIR_REPLY: _pair_reply,
+    _SPLIT_REQUEST: _split_request,
+    _SPLIT_REPLY: _split_reply,
 }
