@@ -29,17 +29,21 @@ from network.links import LinkSettings
 
 class LocalizationPart(Part):
     kind: Literal["clat"] = "clat"
-    form: Literal["safe", "published"] = "safe"
+    form: Literal["safe", "published", "split_joint"] = "safe"
     transform: Literal["unscented", "linearized", "jacobian"] = "unscented"
     correlation: Literal["factors", "ignored"] = "factors"
     pair_interval_s: NotNegative | None = None
     pair_timeout_s: Positive = 2.0
-    innovation_cap: NotNegative = 0.0
+    innovation_cap: NotNegative | None = None
 
     def settings(self) -> LocalizationSettings:
-        """`safe` uses a contact of a pair every 3 s and trace weights; `published` every one and log det."""
+        """`safe` uses a contact of a pair every 3 s and trace weights; `published` every one and log det.
+
+        `split_joint` uses every contact, and caps innovations unless told otherwise.
+        """
         safe = self.form == "safe"
         interval_s = self.pair_interval_s if self.pair_interval_s is not None else (3.0 if safe else 0.0)
+        cap = self.innovation_cap if self.innovation_cap is not None else (9.0 if self.form == "split_joint" else 0.0)
         return LocalizationSettings(
             form=self.form,
             transform=self.transform,
@@ -48,7 +52,7 @@ class LocalizationPart(Part):
             fusion_weight="fast" if safe else "logdet",
             pair_interval_ns=nanoseconds(interval_s),
             pair_timeout_ns=nanoseconds(self.pair_timeout_s),
-            innovation_cap=self.innovation_cap,
+            innovation_cap=cap,
         )
 
 

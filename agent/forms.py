@@ -8,10 +8,13 @@ from collections.abc import Callable
 from agent.cooperative_filter import CooperativeFilter
 from agent.factor_filter import FactorFilter
 from agent.settings import AgentSettings
+from agent.split_filter import SplitFilter
 
 
 def build_filter(
     settings: AgentSettings, counters: Counter[str], count_nis: Callable[[str, float], None]
 ) -> CooperativeFilter:
     """The filter of `settings.localization`."""
+    if settings.localization.form == "split_joint":
+        return SplitFilter(settings, counters, count_nis)
     return FactorFilter(settings, counters, count_nis)

@@ -79,7 +79,7 @@ class _Joint:
             targets,
             world.landmarks,
             transform=scenario.localization.transform,
-            innovation_cap=scenario.localization.innovation_cap,
+            innovation_cap=scenario.localization.innovation_cap or 0.0,
         )
         coast = CoastSettings(scenario.coast.speed_mps, scenario.coast.yaw_rate_radps)
         self._tracks = {name: OdometryTrack(coast, 0, Counter()) for name in world.robots}

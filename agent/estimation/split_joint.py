@@ -11,6 +11,7 @@ since a metric that one unobservable direction dominates would refuse useful upd
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,9 @@ PAIRS_OF_FACTORS = ((1.0, 1.0), (1.0, 2.0), (1.0, 4.0), (1.0, 16.0))
 
 WIDEST = 1e9
 """Largest ratio of the two shared parts' deviations in a bound; any ratio bounds, an infinite one is no number."""
+
+SMALLEST = 1e-150
+"""A deviation that is divided by instead of zero."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,15 +74,15 @@ def update_own(split: Split, H: Array, R: Array) -> SplitUpdate:
     return SplitUpdate(K, after, float(np.trace(np.linalg.solve(P, after.cov))))
 
 
-def _factors(own: float, other: float) -> list[tuple[float, float]]:
-    """Candidates (f_own, f_other) for shared parts that contribute variances `own`, `other` to the innovation."""
-    s_own, s_other = np.sqrt(max(own, 0.0)), np.sqrt(max(other, 0.0))
+def _factors(own: float, other: float) -> Array:
+    """Candidates (c, 2) of (f_own, f_other) for shared parts that contribute variances `own`, `other` to nu."""
+    s_own, s_other = math.sqrt(max(own, 0.0)), math.sqrt(max(other, 0.0))
     q = s_own / (s_own + s_other) if s_own + s_other > 0.0 else 0.5
     found = list(PAIRS_OF_FACTORS)
     for w in (q, (1.0 + q) / 2.0, 0.8, 0.5, 0.2):
-        w = min(max(float(w), 1e-3), 1.0 - 1e-3)
+        w = min(max(w, 1e-3), 1.0 - 1e-3)
         found.append((1.0 / w, 1.0 / (1.0 - w)))
-    return found
+    return np.array(found)
 
 
 def update_from_peer(own: Split, other: Split, H_own: Array, H_other: Array, R: Array) -> SplitUpdate | None:
@@ -90,23 +94,23 @@ def update_from_peer(own: Split, other: Split, H_own: Array, H_other: Array, R: 
     """
     n = len(own.private)
     shared_own, shared_other = H_own @ own.shared @ H_own.T, H_other @ other.shared @ H_other.T
-    known = symmetrize(H_own @ own.private @ H_own.T + H_other @ other.private @ H_other.T + R)
+    foreign = symmetrize(H_other @ other.private @ H_other.T + R)
+    known = symmetrize(H_own @ own.private @ H_own.T) + foreign
     C_private, C_shared = own.private @ H_own.T, own.shared @ H_own.T
     metric = np.linalg.inv(own.cov)
-    best: SplitUpdate | None = None
-    lowest = float(n)
-    for f_own, f_other in _factors(float(np.trace(shared_own)), float(np.trace(shared_other))):
-        K = gain(C_private + f_own * C_shared, known + f_own * shared_own + f_other * shared_other)
-        left = np.eye(n) - K @ H_own
-        X, Y = left @ own.shared @ left.T, K @ shared_other @ K.T
-        sx = np.sqrt(max(float(np.sum(metric * X)), 0.0))
-        sy = np.sqrt(max(float(np.sum(metric * Y)), 0.0))
-        ratio = min(max(sy / sx, 1.0 / WIDEST), WIDEST) if sx > 0.0 else WIDEST
-        bound = X * (1.0 + ratio) + Y * (1.0 + 1.0 / ratio)
-        certain = left @ own.private @ left.T + K @ (H_other @ other.private @ H_other.T + R) @ K.T
-        after = symmetrize(bound + certain)
-        cost = float(np.sum(metric * after))
-        if cost < lowest:
-            lowest = cost
-            best = SplitUpdate(K, Split(np.zeros((n, n)), after), cost)
-    return best
+    factors = _factors(float(np.trace(shared_own)), float(np.trace(shared_other)))
+    f_own, f_other = factors[:, 0, None, None], factors[:, 1, None, None]
+    # One candidate per leading index.
+    K = gain(C_private + f_own * C_shared, known + f_own * shared_own + f_other * shared_other)
+    left = np.eye(n) - K @ H_own
+    left_T, K_T = left.swapaxes(-1, -2), K.swapaxes(-1, -2)
+    X, Y = left @ own.shared @ left_T, K @ shared_other @ K_T
+    sx = np.sqrt(np.maximum(np.sum(metric * X, axis=(-2, -1)), 0.0))
+    sy = np.sqrt(np.maximum(np.sum(metric * Y, axis=(-2, -1)), 0.0))
+    ratio = np.clip(sy / np.maximum(sx, SMALLEST), 1.0 / WIDEST, WIDEST)[:, None, None]
+    after = X * (1.0 + ratio) + Y * (1.0 + 1.0 / ratio) + left @ own.private @ left_T + K @ foreign @ K_T
+    cost = np.sum(metric * after, axis=(-2, -1))
+    best = int(np.argmin(cost))
+    if not cost[best] < n:
+        return None
+    return SplitUpdate(K[best], Split(np.zeros((n, n)), symmetrize(after[best])), float(cost[best]))

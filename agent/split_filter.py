@@ -1,0 +1,299 @@
+"""Cooperative localization by split covariance intersection on the joint state of a robot and its targets.
+
+No correlation factors are kept: noise the robot has told nobody of is independent of all others' errors, everything
+else may be correlated in any way. The claimed covariance holds at any density of contacts, loss, delay and order.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.effects import Effect, Estimate, Send, TrackEstimate
+from agent.estimation.motion import STATES
+from agent.estimation.observation import (
+    RELATIVE_ANGLES,
+    AbsoluteModel,
+    OutOfViewError,
+    RelativeModel,
+    relative_model,
+)
+from agent.events import LinkChange, Observation, Received
+from agent.joint_history import JointHistory, Learnt
+from agent.joint_state import JointModel, JointState, Used
+from agent.pair_clock import PairClocks
+from agent.settings import AgentSettings
+from agent.split_exchange import SplitExchange
+from network.messages import (
+    MAX_JOINT_DIM,
+    MAX_MEASUREMENTS,
+    MAX_MESSAGE_BYTES,
+    Body,
+    Epoch,
+    Measurement,
+    PairRequest,
+    SplitReply,
+    SplitRequest,
+    SplitSnapshot,
+)
+from network.wire import size_bound
+
+Array = NDArray[np.float64]
+
+FAR_FUTURE_NS = 2**62
+LONGEST = Epoch(2**62, "r" * 24, 2**53)
+
+
+class SplitFilter:
+    """The form `split_joint`; see `agent.cooperative_filter` for what each method is given."""
+
+    def __init__(
+        self, settings: AgentSettings, counters: Counter[str], count_nis: Callable[[str, float], None]
+    ) -> None:
+        self._settings, self._counters, self._count_nis = settings, counters, count_nis
+        self._model = JointModel(settings)
+        self.history = JointHistory(self._model, settings.lateness, self._model.initial(), counters)
+        self._motions = {target.id: target.motion for target in settings.targets}
+        self._clocks = PairClocks(settings)
+        self._exchanges: dict[str, SplitExchange] = {}
+        self._lives: dict[str, tuple[int, int]] = {}
+        self._contacts: dict[str, Epoch] = {}
+
+    @property
+    def state(self) -> JointState:
+        return self.history.newest
+
+    @property
+    def t_ns(self) -> int:
+        return self.state.t_ns
+
+    @property
+    def revision(self) -> object:
+        return self.state
+
+    def advance(self, t_ns: int, delta: Array, cov: Array) -> None:
+        self.history.advance(t_ns, delta, cov)
+
+    def estimate(self) -> Estimate:
+        state, n = self.state, self._settings.layout.dim
+        cov = state.cov
+        tracks = tuple(
+            TrackEstimate(name, self._motions[name].layout.name, state.mean[block], cov[block, block])
+            for name, block in zip(state.tracks, self._model.blocks(state))
+        )
+        return Estimate(state.t_ns, self._settings.layout.name, state.mean[:n], cov[:n, :n], tracks)
+
+    def contacts(self) -> dict[str, Epoch]:
+        return dict(self._contacts)
+
+    def form(self) -> tuple[str, str]:
+        return "split_joint", "configured"
+
+    # -- own information ------------------------------------------------------------------------------------
+
+    def _at(self, t_ns: int) -> JointState | None:
+        """The state own data of `t_ns` are used in; None if they come too late."""
+        late = t_ns < self.t_ns - self._settings.lateness.tolerance_ns
+        if not late:
+            return self.state
+        return None if self._settings.lateness.kind == "discard" else self.history.at(t_ns)
+
+    def absolute(self, t_ns: int, kind: str, model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> None:
+        then = self._at(t_ns)
+        if then is None:
+            self._counters["late.dropped"] += 1
+            return
+        late = then is not self.state
+        used = self._learn(then, lambda state: self._model.absolute(state, model, z, R))
+        if used is None:
+            return
+        if late:
+            self._counters["late.compensated"] += 1
+        self._counters[f"used.{kind}"] += 1
+        self._count_nis(kind, used.nis)
+
+    def sighting(self, t_ns: int, target: str, event: Observation) -> None:
+        then = self._at(t_ns)
+        if then is None:
+            self._counters["late.target_dropped"] += 1
+            return
+        if target not in then.tracks:
+            self._counters["observation.unknown_target"] += 1
+            return
+        late = then is not self.state
+        model = relative_model(event, self._settings.layout, self._motions[target].layout)
+        used = self._learn(then, lambda state: self._model.sighting(state, target, model, event.z, event.R))
+        if used is None:
+            return
+        if late:
+            self._counters["late.target_compensated"] += 1
+        self._counters["used.sighting"] += 1
+        self._count_nis(f"target_{event.kind}", used.nis)
+
+    def _learn(self, then: JointState, use: Callable[[JointState], Used], again: Learnt | None = None) -> Used | None:
+        """Use information at the instant of `then`; `again`: how it is used if earlier information turns up later."""
+        try:
+            used = use(then)
+        except OutOfViewError:
+            raise
+        except np.linalg.LinAlgError:
+            self._counters["update.not_positive_definite"] += 1
+            return None
+        self.history.learn(used.state, again or (lambda state: use(state).state))
+        return used
+
+    # -- peers ----------------------------------------------------------------------------------------------
+
+    def _exchange(self, peer: str) -> SplitExchange:
+        if peer not in self._exchanges:
+            timeout_ns = self._settings.localization.pair_timeout_ns
+            self._exchanges[peer] = SplitExchange(self._settings.robot, timeout_ns, self._settings.lateness.horizon_ns)
+        return self._exchanges[peer]
+
+    def _told(self, then: JointState, measurements: tuple[Measurement, ...]) -> SplitSnapshot:
+        """The belief as it is sent, with as many tracks as fit; its private noise is shared from now on."""
+        tracks = list(then.tracks)
+        while True:
+            snapshot = self._model.snapshot(then, tracks)
+            fits = len(snapshot.mean) <= MAX_JOINT_DIM and (
+                size_bound(SplitRequest(LONGEST, measurements, snapshot)) <= MAX_MESSAGE_BYTES
+            )
+            if fits or not tracks:
+                break
+            tracks.pop()
+            self._counters["pair.shortened"] += 1
+        if snapshot.private is not None:
+            self.history.learn(_shared(then), _shared)
+        return snapshot
+
+    def measured(
+        self, peer: str, t_ns: int, now_ns: int, measurements: tuple[Measurement, ...], effects: list[Effect]
+    ) -> None:
+        exchange = self._exchange(peer)
+        last = self._contacts.get(peer)
+        if exchange.full:
+            self._counters["pair.skip_pending"] += 1
+            return
+        if last is not None and t_ns - last.t_meas_ns < self._settings.localization.pair_interval_ns:
+            self._counters["pair.skip_thinned"] += 1
+            return
+        then = self.history.at(t_ns)
+        if then is None:
+            self._counters["pair.too_old_own"] += 1
+            return
+        told = tuple(self._clocks.widened(peer, item) for item in measurements[:MAX_MEASUREMENTS])
+        request = exchange.open(t_ns, now_ns, told, self._told(then, told))
+        self._counters["pair.started"] += 1
+        effects.append(Send(peer, t_ns, request))
+
+    def instant_ns(self, event: Received) -> int:
+        body = event.message.body
+        assert isinstance(body, PairRequest | SplitRequest)
+        return body.epoch.t_meas_ns - self._clocks.offset_ns(event)
+
+    def requested(self, event: Received, t_ns: int, effects: list[Effect]) -> None:
+        peer, request = event.message.header.source, event.message.body
+        if not isinstance(request, SplitRequest):
+            self._counters["pair.other_form"] += 1
+            return
+        if not _usable(request.snapshot) or any(item.kind not in RELATIVE_ANGLES for item in request.measurements):
+            self._counters["pair.malformed"] += 1
+            return
+        exchange, epoch = self._exchange(peer), request.epoch
+        if exchange.known(epoch):
+            self._counters["pair.request_repeat_reply"] += 1
+            reply = exchange.reply_to(epoch)
+            if reply is not None:
+                effects.append(Send(peer, epoch.t_meas_ns, reply))
+            return
+        then = self.history.at(t_ns)
+        if then is None:
+            self._counters["pair.too_old"] += 1
+            exchange.answered(epoch, None)
+            return
+        reply = SplitReply(epoch, self._told(then, ()))
+        exchange.answered(epoch, reply)
+        effects.append(Send(peer, epoch.t_meas_ns, reply))
+        self._apply(peer, epoch, t_ns, request.snapshot, request.measurements, own_initiated=False)
+
+    def replied(self, peer: str, body: Body) -> None:
+        if not isinstance(body, SplitReply):
+            self._counters["pair.other_form"] += 1
+            return
+        request = self._exchange(peer).replied(body.epoch)
+        if request is None:
+            self._counters["pair.reply_ignore"] += 1
+            return
+        if not _usable(body.snapshot):
+            self._counters["pair.malformed"] += 1
+            return
+        epoch = request.epoch
+        self._apply(peer, epoch, epoch.t_meas_ns, body.snapshot, request.measurements, own_initiated=True)
+
+    def _apply(
+        self,
+        peer: str,
+        epoch: Epoch,
+        t_ns: int,
+        told: SplitSnapshot,
+        measurements: tuple[Measurement, ...],
+        own_initiated: bool,
+    ) -> None:
+        then = self.history.at(t_ns)
+        if then is None:
+            self._counters["pair.too_old_own"] += 1
+            return
+
+        def use(state: JointState, trusted: bool) -> Used:
+            return self._model.from_peer(state, told, measurements, own_initiated, trusted)
+
+        try:
+            # What turns up later may have gone through third robots: the peer's private noise is not independent then.
+            used = self._learn(then, lambda state: use(state, True), lambda state: use(state, False).state)
+        except OutOfViewError:
+            self._counters["pair.out_of_view"] += 1
+            return
+        if used is None:
+            return
+        last = self._contacts.get(peer)
+        if last is None or last < epoch:
+            self._contacts[peer] = epoch
+        self._count_nis("pair_" + "+".join(item.kind for item in measurements), used.nis)
+        self._counters["pair.applied_initiator" if own_initiated else "pair.applied_responder"] += 1
+
+    def heard(self, event: Received, effects: list[Effect]) -> None:
+        self._counters["received.unused"] += 1
+
+    def link_changed(self, event: LinkChange) -> None:
+        life = (event.incarnation, event.boot_id)
+        before = self._lives.get(event.peer)
+        self._lives[event.peer] = life
+        if before is not None and before != life:
+            self._exchange(event.peer).restarted()
+            self._counters["pair.restarts"] += 1
+
+    def expire(self, now_ns: int, effects: list[Effect]) -> None:
+        for peer, exchange in self._exchanges.items():
+            repeat, gone = exchange.expired(now_ns)
+            for request in repeat:
+                self._counters["pair.repeated"] += 1
+                effects.append(Send(peer, request.epoch.t_meas_ns, request))
+            if gone:
+                self._counters["pair.timed_out"] += gone
+
+    def deadline_ns(self) -> int:
+        found = [exchange.deadline_ns() for exchange in self._exchanges.values()]
+        return min((deadline for deadline in found if deadline is not None), default=FAR_FUTURE_NS)
+
+
+def _shared(state: JointState) -> JointState:
+    return JointState(state.t_ns, state.mean, state.split.told(), state.tracks)
+
+
+def _usable(told: SplitSnapshot) -> bool:
+    """Whether a snapshot is of a robot."""
+    layout = STATES.get(told.model)
+    return layout is not None and layout.heading is not None
