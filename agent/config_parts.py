@@ -29,7 +29,7 @@ from network.links import LinkSettings
 
 class LocalizationPart(Part):
     kind: Literal["clat"] = "clat"
-    form: Literal["safe", "published", "split_joint"] = "safe"
+    form: Literal["split_joint", "safe", "published"] = "split_joint"
     transform: Literal["unscented", "linearized", "jacobian"] = "unscented"
     correlation: Literal["factors", "ignored"] = "factors"
     pair_interval_s: NotNegative | None = None
@@ -39,8 +39,13 @@ class LocalizationPart(Part):
     def settings(self) -> LocalizationSettings:
         """`safe` uses a contact of a pair every 3 s and trace weights; `published` every one and log det.
 
-        `split_joint` uses every contact, and caps innovations unless told otherwise.
+        `split_joint` uses every contact, and caps innovations unless told otherwise. Raises `ConfigError` for a naive
+        baseline without factors.
         """
+        if self.correlation == "ignored" and self.form == "split_joint":
+            raise ConfigError(
+                "correlation = 'ignored' is a baseline of the forms with factors; add form = 'published' or 'safe'"
+            )
         safe = self.form == "safe"
         interval_s = self.pair_interval_s if self.pair_interval_s is not None else (3.0 if safe else 0.0)
         cap = self.innovation_cap if self.innovation_cap is not None else (9.0 if self.form == "split_joint" else 0.0)

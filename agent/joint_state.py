@@ -25,9 +25,10 @@ from network.messages import Measurement, SplitSnapshot
 Array = NDArray[np.float64]
 
 RESIDUAL_FACTOR = 6.0
-"""How often the second-order residual of a measurement is charged.
+"""How often the second-order residual of a measurement of a robot or target is charged.
 
-Errors of linearization recur with the same sign as long as the geometry stays; white noise of their size is too little.
+Where both ends are uncertain, errors of linearization recur with the same sign as long as the geometry stays; white
+noise of their size is too little.
 """
 
 SAME_TARGET_M2 = 1e-4
@@ -119,15 +120,22 @@ class JointModel:
 
     def absolute(self, state: JointState, model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> Used:
         """Use information about the own state alone."""
-        return self._measured(state, model, z, R, list(range(self._own.stop)))
+        return self._measured(state, model, z, R, list(range(self._own.stop)), 1.0)
 
     def sighting(self, state: JointState, target: str, model: RelativeModel, z: Array, R: Array) -> Used:
         """Use a relative measurement of a target of `state.tracks`."""
         block = self.blocks(state)[state.tracks.index(target)]
-        return self._measured(state, model, z, R, [*range(self._own.stop), *range(block.start, block.stop)])
+        part = [*range(self._own.stop), *range(block.start, block.stop)]
+        return self._measured(state, model, z, R, part, RESIDUAL_FACTOR)
 
     def _measured(
-        self, state: JointState, model: AbsoluteModel | RelativeModel, z: Array, R: Array, part: list[int]
+        self,
+        state: JointState,
+        model: AbsoluteModel | RelativeModel,
+        z: Array,
+        R: Array,
+        part: list[int],
+        residual_factor: float,
     ) -> Used:
         cov = state.cov
         predicted = observe(
@@ -140,7 +148,7 @@ class JointModel:
             self._parameters,
         )
         innovation = wrap_components(z - predicted.z, model.angles)
-        noise = symmetrize(R + RESIDUAL_FACTOR * predicted.residual)
+        noise = symmetrize(R + residual_factor * predicted.residual)
         H = np.zeros((len(z), len(state.mean)))
         H[:, part] = predicted.H
         S = H @ cov @ H.T + noise

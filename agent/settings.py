@@ -33,7 +33,7 @@ class LocalizationSettings:
     max_lines                         identity lines kept per peer
     """
 
-    form: Literal["safe", "published", "split_joint"] = "safe"
+    form: Literal["split_joint", "safe", "published"] = "split_joint"
     transform: Transform = "unscented"
     correlation: Literal["factors", "ignored"] = "factors"
     sighting_weight: Weight = "trace"

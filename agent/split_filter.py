@@ -177,7 +177,7 @@ class SplitFilter:
         if exchange.full:
             self._counters["pair.skip_pending"] += 1
             return
-        if last is not None and t_ns - last.t_meas_ns < self._settings.localization.pair_interval_ns:
+        if last is not None and abs(t_ns - last.t_meas_ns) < self._settings.localization.pair_interval_ns:
             self._counters["pair.skip_thinned"] += 1
             return
         then = self.history.at(t_ns)
@@ -258,9 +258,7 @@ class SplitFilter:
             return
         if used is None:
             return
-        last = self._contacts.get(peer)
-        if last is None or last < epoch:
-            self._contacts[peer] = epoch
+        self._contacts[peer] = epoch
         self._count_nis("pair_" + "+".join(item.kind for item in measurements), used.nis)
         self._counters["pair.applied_initiator" if own_initiated else "pair.applied_responder"] += 1
 

@@ -69,12 +69,27 @@ class PlacementPart(Part):
     max_draws: Annotated[int, Field(ge=1)] = 10000
 
 
+class SteeringPart(Part):
+    """How robots are steered on their true places, instead of by constant controls; so every method sees the same.
+
+    `potential`: they keep around the first target and off each other; see `agent.planning.potential`.
+    """
+
+    rule: Literal["potential"] = "potential"
+    max_speed_mps: Positive = 0.5
+    max_turn_radps: Positive = 0.62831853
+    apart_m: Positive = 10.0
+    closest_m: Positive = 6.0
+    radio_range_m: Positive = 30.0
+
+
 class WorldPart(Part):
     kind: Literal["simulated", "recording"] = "simulated"
     format: Literal["utias", "tiers"] = "utias"
     path: str | None = None
     robots: list[Id] | None = None
     placement: PlacementPart | None = None
+    steering: SteeringPart | None = None
 
 
 class CirclePart(Part):
@@ -83,9 +98,13 @@ class CirclePart(Part):
 
 
 class StartPart(Part):
-    """True start: a pose (x, y[, z], heading), a full target state, or a place on a circle drawn from the seed."""
+    """True start: a pose (x, y[, z], heading), a full target state, or a place on a circle drawn from the seed.
+
+    A pose may be off by up to `spread` (of each number), drawn evenly from the seed.
+    """
 
     pose: Annotated[list[Finite], Field(min_length=3, max_length=6)] | None = None
+    spread: Annotated[list[NotNegative], Field(max_length=6)] = []
     circle: CirclePart | None = None
 
 
@@ -93,7 +112,9 @@ class SensorPart(Part):
     """A sensor: what it measures (`kind`, by default its name), of whom, how well, how far and how often.
 
     sigma_m grows by sigma_m_per_m with the distance; sigma_z_m is that of an altitude, sigma_m by default. `rate_hz`
-    absent: once per step. Simulated ranges are too long by `bias_m`, or by what `bias_of` says of the subject.
+    absent: once per step. Nothing is seen beyond `max_range_m`, nearer than `min_range_m` or out of the field of view
+    `fov_rad`, which is centred on the sensor's forward axis. Simulated ranges are too long by `bias_m`, or by what
+    `bias_of` says of the subject.
     """
 
     kind: SensorKind | None = None
@@ -106,6 +127,8 @@ class SensorPart(Part):
     bias_m: Finite = 0.0
     bias_of: dict[str, Finite] = {}
     max_range_m: Positive | None = None
+    min_range_m: NotNegative = 0.0
+    fov_rad: Positive | None = None
     rate_hz: Positive | None = None
     mount: MountVector = [0.0, 0.0, 0.0]
     intrinsics: IntrinsicsPart = IntrinsicsPart()
@@ -332,6 +355,7 @@ def check(scenario: Scenario) -> None:
             f"{scenario.name}: world.placement.reaches = '{placement.reaches}' is no robot on a circle; "
             f"there are: {', '.join(circling)}"
         )
+    _check_steering(scenario)
     for robot in scenario.robots:
         _check_mover(f"{scenario.name}: robots.{robot.id}", robot)
         if recorded and LAYOUTS[robot.model].altitude is not None:
@@ -339,7 +363,11 @@ def check(scenario: Scenario) -> None:
                 f"{scenario.name}: robots.{robot.id}.model = '{robot.model}' has an altitude, and recordings are "
                 "planar; take 'unicycle'"
             )
-        scenario.localization_of(robot), scenario.lateness_of(robot), scenario.tracking_of(robot)
+        scenario.lateness_of(robot), scenario.tracking_of(robot)
+        try:
+            scenario.localization_of(robot).settings()
+        except ConfigError as error:
+            raise ConfigError(f"{scenario.name}: localization: {error}") from None
         if not recorded and (robot.start.pose is None) == (robot.start.circle is None):
             raise ConfigError(f"{scenario.name}: robots.{robot.id}.start needs either 'pose' or 'circle'")
         if robot.start.circle is not None and scenario.world.placement is None:
@@ -361,6 +389,22 @@ def check(scenario: Scenario) -> None:
             )
         if not recorded and target.start.pose is None:
             raise ConfigError(f"{scenario.name}: targets.{target.id}.start.pose is missing")
+
+
+def _check_steering(scenario: Scenario) -> None:
+    """Steered robots move in the plane around a target, and by nothing else."""
+    if scenario.world.steering is None:
+        return
+    where = f"{scenario.name}: world.steering"
+    if scenario.world.kind == "recording":
+        raise ConfigError(f"{where} does not go with a recording; leave it out")
+    if not scenario.targets:
+        raise ConfigError(f"{where} needs one of [[targets]] to keep around")
+    for robot in scenario.robots:
+        if robot.model != "unicycle":
+            raise ConfigError(f"{where}: robots.{robot.id}.model = '{robot.model}' is not steered; take 'unicycle'")
+        if robot.control != ControlPart():
+            raise ConfigError(f"{where}: robots.{robot.id}.control is not used with it; leave it out")
 
 
 def _check_mover(where: str, part: RobotPart | TargetPart) -> None:

@@ -26,6 +26,7 @@ from agent.settings import NS, nanoseconds
 from agent.timeline import Phase
 from sim.noise import generator, normal_rows
 from sim.scenario import RobotPart, Scenario, SensorPart, TargetPart, sensor_kind
+from sim.steering import steered
 
 Array = NDArray[np.float64]
 
@@ -138,11 +139,18 @@ class SimulatedWorld:
         self.steps = round(scenario.duration_s * NS) // self.step_ns
         phases = draw_phases(scenario, seed)
         self._tracks: dict[str, Array] = {}
-        for robot in scenario.robots:
-            self._tracks[robot.id] = self._drive(robot, start_pose(robot, phases))
+        self._commands: dict[str, Array] = {}
         for target in scenario.targets:
-            assert target.start.pose is not None
-            self._tracks[target.id] = self._drive(target, np.array(target.start.pose))
+            self._tracks[target.id] = self._drive(target, start_pose(target, phases, seed))
+        starts = {robot.id: start_pose(robot, phases, seed) for robot in scenario.robots}
+        if scenario.world.steering is not None:
+            around = self._tracks[scenario.targets[0].id]
+            tracks, commands = steered(scenario, scenario.world.steering, starts, around, seed, self.steps)
+            self._tracks |= tracks
+            self._commands |= commands
+        else:
+            for robot in scenario.robots:
+                self._tracks[robot.id] = self._drive(robot, starts[robot.id])
         self._tilt = {
             robot.id: robot.tilt_rad * normal_rows(seed, self.steps + 1, 2, robot.id, "attitude")
             for robot in scenario.robots
@@ -229,7 +237,10 @@ class SimulatedWorld:
     def _odometry(self, robot: RobotPart, k: int) -> Output:
         dt = self._scenario.step_s
         control = robot.control
-        delta = dt * np.array([control.speed_mps, 0.0, control.climb_mps, control.yaw_rate_radps])
+        speed, yaw_rate = control.speed_mps, control.yaw_rate_radps
+        if robot.id in self._commands:
+            speed, yaw_rate = self._commands[robot.id][k - 1]
+        delta = dt * np.array([speed, 0.0, control.climb_mps, yaw_rate])
         noise = control_odometry(robot, dt)
         if LAYOUTS[robot.model] is UNICYCLE_GAINS:
             delta[[0, 1, 3]] = reported(self._tracks[robot.id][k - 1], delta[[0, 1, 3]])
@@ -267,8 +278,12 @@ class SimulatedWorld:
             )
             joint = state if subject is None else np.concatenate([state, place])
             distance = float(replace(model, kind="range").h(joint)[0])
-            if sensor.max_range_m is not None and distance > sensor.max_range_m:
+            if distance < sensor.min_range_m or (sensor.max_range_m is not None and distance > sensor.max_range_m):
                 continue
+            if sensor.fov_rad is not None:
+                (azimuth,) = replace(model, kind="bearing").h(joint)
+                if abs(azimuth) > 0.5 * sensor.fov_rad:
+                    continue
             try:
                 clean = model.h(joint)
             except OutOfViewError:
@@ -327,11 +342,14 @@ def drawn_belief(truth: Array, cov: Array, seed: int, entity: str, angles: tuple
     return wrap_components(mean, angles), cov
 
 
-def start_pose(robot: RobotPart, phases: dict[str, float]) -> Array:
+def start_pose(robot: RobotPart | TargetPart, phases: dict[str, float], seed: int) -> Array:
     """True start of a robot; on a circle it heads along the tangent, counter-clockwise, at its commanded altitude."""
     if robot.start.circle is None:
         assert robot.start.pose is not None
-        return np.array(robot.start.pose)
+        pose, spread = np.array(robot.start.pose), np.array(robot.start.spread)
+        if len(spread):
+            pose[: len(spread)] += spread * generator(seed, robot.id, "place").uniform(-1.0, 1.0, len(spread))
+        return pose
     phase, circle = phases[robot.id], robot.start.circle
     x = circle.center_m[0] + circle.radius_m * np.cos(phase)
     y = circle.center_m[1] + circle.radius_m * np.sin(phase)

@@ -90,7 +90,13 @@ def test_without_tracking_no_target_is_tracked() -> None:
 
 
 def test_the_forms_stand_for_their_parts() -> None:
-    safe, published = LocalizationPart().settings(), LocalizationPart(form="published").settings()
+    split, safe, published = (
+        LocalizationPart(form=form).settings() for form in ("split_joint", "safe", "published")
+    )
+    assert LocalizationPart().settings() == split
+    assert (split.pair_interval_ns, split.innovation_cap) == (0, 9.0)
+    assert (safe.innovation_cap, published.innovation_cap) == (0.0, 0.0)
+    assert LocalizationPart(innovation_cap=0.0).settings().innovation_cap == 0.0
     assert (safe.pair_interval_ns, safe.sighting_weight) == (3_000_000_000, "trace")
     assert (published.pair_interval_ns, published.sighting_weight) == (0, "logdet")
     assert LocalizationPart(pair_interval_s=0.5).settings().pair_interval_ns == 500_000_000

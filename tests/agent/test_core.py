@@ -33,7 +33,7 @@ def agent(**lateness: object) -> Agent:
             mean=np.array([1.0, 2.0, 0.4]),
             cov=np.diag([0.3, 0.2, 0.05]),
             landmarks={"L1": (5.0, 1.0)},
-            localization=LocalizationSettings(transform="jacobian"),
+            localization=LocalizationSettings(form="safe", transform="jacobian"),
             lateness=replace(LatenessSettings(), **lateness),  # type: ignore[arg-type]
         )
     )

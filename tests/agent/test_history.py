@@ -34,7 +34,7 @@ def plain(cov: Array = KNOWN_HEADING, horizon_ns: int = 60 * NS) -> AgentSetting
         start_ns=0,
         mean=np.array([1.0, 2.0, 0.4]),
         cov=cov,
-        localization=LocalizationSettings(transform="jacobian"),
+        localization=LocalizationSettings(form="safe", transform="jacobian"),
         lateness=LatenessSettings(horizon_ns=horizon_ns, tolerance_ns=0),
     )
 
@@ -127,7 +127,7 @@ def test_a_stream_of_late_fixes_stays_honest(late_steps: int) -> None:
         rng = np.random.default_rng(seed)
         truth = [np.array([1.0, 2.0, 0.4]) + rng.multivariate_normal(np.zeros(3), np.diag([0.3, 0.2, 0.01]))]
         base = plain(np.diag([0.3, 0.2, 0.01]))
-        subject = Agent(replace(base, localization=LocalizationSettings()))
+        subject = Agent(replace(base, localization=LocalizationSettings(form="safe")))
         sigma = np.array([0.05, 0.05, 0.002])
         noise = np.diag([sigma[0], sigma[1], 0.0, sigma[2]]) ** 2
         for k in range(200):

@@ -125,7 +125,7 @@ def test_an_unknown_correlation_doubles_the_covariance_once_and_the_pair_goes_on
 def test_a_peer_that_keeps_restarting_cannot_inflate_us_without_limit() -> None:
     pair = met_pair(until_s=1)
     base = pair.agents[FIRST].settings
-    limited = replace(base, localization=LocalizationSettings(restart_interval_ns=60 * NS))
+    limited = replace(base, localization=LocalizationSettings(form="safe", restart_interval_ns=60 * NS))
     pair.agents[FIRST] = Agent(limited)
     subject = pair.agents[FIRST]
     pair.odometry(FIRST, 0, NS, np.array([0.3, 0.0, 0.0, 0.1]), NOISE)
@@ -152,7 +152,7 @@ def test_a_clock_that_is_off_is_mapped_and_its_doubt_widens_the_noise() -> None:
                 start_ns=0,
                 mean=mean,
                 cov=cov,
-                localization=LocalizationSettings(pair_interval_ns=0),
+                localization=LocalizationSettings(form="safe", pair_interval_ns=0),
                 lateness=lateness,
             )
         )

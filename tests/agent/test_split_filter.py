@@ -294,7 +294,8 @@ def test_other_forms_are_refused_and_counted() -> None:
     reply = PairReply(item.body.epoch, ReplyStatus.BUSY)
     team.deliver(("r2", Send("r1", 0, reply)))
     assert team.agents["r1"].counters["pair.other_form"] == 1
-    plain = Agent(replace(settings("r3", np.array(PLACES["r3"]), np.eye(3), None), localization=LocalizationSettings()))
+    base = settings("r3", np.array(PLACES["r3"]), np.eye(3), None)
+    plain = Agent(replace(base, localization=LocalizationSettings(form="safe")))
     stranger = Team({"r3": plain})
     stranger.deliver(("r1", Send("r3", 0, item.body)))
     stranger.deliver(("r1", Send("r3", 0, SplitReply(item.body.epoch, item.body.snapshot))))

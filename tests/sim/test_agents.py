@@ -56,7 +56,8 @@ def test_parts_overridden_for_one_robot_reach_it_alone() -> None:
         "robots.r2.sensors.range.mount=[0.1, 0.2, 0.3]",
         "robots.r3.sensors.range.two_way=false",
     )
-    assert [config.localization.form for config in configs.values()] == ["safe", "published", "safe", "safe"]
+    forms = {name: config.localization.form for name, config in configs.items()}
+    assert forms == {"r1": "split_joint", "r2": "published", "r3": "split_joint", "r4": "split_joint"}
     assert [config.lateness.kind for config in configs.values()] == [
         "compensate",
         "compensate",

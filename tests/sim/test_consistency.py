@@ -66,6 +66,6 @@ def test_the_target_is_not_claimed_to_be_known_better_than_it_is(
 
 def test_without_correlations_the_fleet_fools_itself() -> None:
     """The naive baseline: robots that treat each other as independent grow far too sure."""
-    naive = anees(["localization.correlation=ignored"], FEW_SEEDS)
+    naive = anees(["localization.form=safe", "localization.correlation=ignored"], FEW_SEEDS)
     for robot in ("r1", "r2", "r3", "r4"):
         assert np.mean(list(naive[robot].values())) > 5.0, report(robot, naive[robot])

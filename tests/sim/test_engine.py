@@ -13,7 +13,7 @@ from agent.effects import Effect, Send
 from agent.events import Event, LinkChange, Observation, Received
 from agent.node import Node, Outgoing
 from network.links import FateRecord, packet_fate
-from network.messages import Packet, PairReply, PairRequest
+from network.messages import Packet, PairReply, PairRequest, SplitReply, SplitRequest
 from sim.engine import TrialResult, VirtualEngine, network_figures, sample_stride
 from sim.metrics import StateTrace
 from sim.scenario import Scenario, check
@@ -144,15 +144,16 @@ def test_with_zero_delay_an_exchange_completes_before_anything_else_happens() ->
     run = Run(scenario())
     exchanges = 0
     for index, (robot, event, effects) in enumerate(run.events):
-        sent = [effect for effect in effects if isinstance(effect, Send) and isinstance(effect.body, PairRequest)]
+        sends = [effect for effect in effects if isinstance(effect, Send)]
+        sent = [effect for effect in sends if isinstance(effect.body, PairRequest | SplitRequest)]
         if not sent:
             continue
         (request,) = sent
         asked, asked_event, _ = run.events[index + 1]
         answered, answer_event, _ = run.events[index + 2]
         assert isinstance(asked_event, Received) and isinstance(answer_event, Received)
-        assert isinstance(asked_event.message.body, PairRequest)
-        assert isinstance(answer_event.message.body, PairReply)
+        assert isinstance(asked_event.message.body, PairRequest | SplitRequest)
+        assert isinstance(answer_event.message.body, PairReply | SplitReply)
         assert (asked, answered) == (request.peer, robot)
         assert asked_event.message.body.epoch == answer_event.message.body.epoch == request.body.epoch
         assert event.t_ns == asked_event.t_ns == answer_event.t_ns

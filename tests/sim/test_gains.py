@@ -42,6 +42,7 @@ def fleet(**change: Any) -> Scenario:
         "step_s": 1.0,
         "window_s": [20.0, 80.0],
         "tracking": {"kind": "none"},
+        "localization": {"form": "safe"},
         "robots": [robot(index) for index in (1, 2, 3)],
     }
     return Scenario.model_validate(data | change)
@@ -76,7 +77,7 @@ def test_messages_stay_within_one_datagram_when_contacts_are_open() -> None:
     lossy = ["links.loss=0.6", "links.delay_s=0.1", "lateness.horizon_s=1.5", "tracking.kind=none"]
     made = load("ut-clat", ["duration_s=60", "window_s=[10,60]", *lossy])
     data = made.model_dump(exclude_none=True)
-    data["localization"] |= {"pair_interval_s": 0.0, "pair_timeout_s": 0.3}
+    data["localization"] |= {"form": "published", "pair_timeout_s": 0.3}
     for robot in data["robots"]:
         robot["model"] = "unicycle_gains"
         robot["start_sigma"] |= {"gain_along": 0.05, "gain_turn": 0.05}

@@ -88,7 +88,7 @@ def test_a_robot_may_localize_in_its_own_way() -> None:
     scenario = load("ut-clat", ["robots.r2.localization.form=published", "localization.pair_timeout_s=7"])
     assert scenario.localization_of(robot(scenario, "r2")).form == "published"
     assert scenario.localization_of(robot(scenario, "r2")).pair_timeout_s == 7.0
-    assert scenario.localization_of(robot(scenario, "r1")).form == "safe"
+    assert scenario.localization_of(robot(scenario, "r1")).form == "split_joint"
     assert scenario.localization_of(robot(scenario, "r2")).settings().pair_interval_ns == 0
 
 
@@ -167,7 +167,7 @@ def test_a_mistake_is_answered_with_the_key_and_the_remedy(override: str, words:
 
 def test_an_unknown_scenario_is_answered_with_the_nearest_name() -> None:
     assert "did you mean 'ut-clat'?" in complaint(name="ut_clat")
-    assert "bundled: demo, tiers-uwb, ut-clat" in complaint(name="zzz")
+    assert "bundled: demo, dense-10, dense-10-anchored, dense-6," in complaint(name="zzz")
 
 
 def test_a_recording_needs_its_path_and_has_no_more_than_it_holds() -> None:

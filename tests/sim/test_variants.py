@@ -81,7 +81,7 @@ def test_variants_of_what_only_agents_do_share_their_centralized_filter() -> Non
         return bound_leaders([load("ut-clat", [override]) for override in overrides])
 
     assert leaders("links.loss=0", "links.loss=0.3", "localization.form=published", "lateness.kind=discard") == [0] * 4
-    assert leaders("localization.correlation=ignored", "robots.r2.localization.form=published") == [0, 0]
+    assert leaders("localization.form=safe", "robots.r2.localization.form=published") == [0, 0]
     assert leaders("links.loss=0", "localization.transform=jacobian", "localization.innovation_cap=3") == [0, 1, 2]
     assert leaders("links.loss=0", "robots.r2.sensors.range.sigma_m=0.1", "coast.speed_mps=1") == [0, 1, 2]
     assert leaders("window_s=[0,100]", "window_s=[50,100]", "window_s=[0,100]") == [0, 1, 0]

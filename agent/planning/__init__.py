@@ -1,0 +1,1 @@
+"""Where robots should go: laws of motion as pure functions."""
