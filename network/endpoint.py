@@ -38,7 +38,8 @@ from network.messages import (
     SplitRequest,
 )
 from network.peers import Peer, PeerTable
-from network.wire import MAX_INT, OversizeError, WireError, decode, encode, valid_id
+from network.wire import OversizeError, decode, encode
+from network.wire_fields import MAX_INT, WireError, valid_id
 
 MIN_MAX_BYTES = 900
 """A hello with all its echoes must fit."""

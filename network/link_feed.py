@@ -14,7 +14,7 @@ import zenoh
 
 from network.links import Pair, decode_table, encode_table
 from network.transport import TransportError
-from network.wire import WireError
+from network.wire_fields import WireError
 
 KEY = "cofix/world/links"
 

@@ -20,7 +20,7 @@ import msgpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from network.wire import MAX_INT, WireError, valid_id
+from network.wire_fields import MAX_INT, WireError, valid_id
 
 MAX_TABLE_ROBOTS = 256
 MAX_TABLE_BYTES = 16_384

@@ -23,7 +23,7 @@ import zenoh
 
 from network.messages import MAX_MESSAGE_BYTES, SCHEMA, Channel, Packet
 from network.transport import OnPacket, TransportError
-from network.wire import valid_id
+from network.wire_fields import valid_id
 
 _LOG = logging.getLogger(__name__)
 _PREFIX = f"cofix/v{SCHEMA}"

@@ -35,7 +35,7 @@ from agent.config_parts import (
 from agent.events import Observation
 from agent.sensor_input import ABSOLUTE_KINDS, SIZES, decode
 from deploy.cli import main, parser
-from network.wire import REASONS
+from network.wire_fields import REASONS
 from sim.scenario import Scenario, StartPart
 from tests.desk_agent import desk_agent
 

@@ -21,7 +21,7 @@ from network.links import (
     hear,
     packet_fate,
 )
-from network.wire import WireError
+from network.wire_fields import WireError
 
 PACKET = {"source": "r1", "destination": "r2", "channel": "pair", "incarnation": 1, "seq": 7}
 HARSH = LinkSettings(seed=3, loss=0.3, delay_s=0.1, delay_tail_s=0.05, duplicate=0.2)

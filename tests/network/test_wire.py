@@ -35,18 +35,8 @@ from network.messages import (
     Snapshot,
     TargetBelief,
 )
-from network.wire import (
-    MAX_INT,
-    MEASUREMENT_DIMS,
-    MODEL_DIMS,
-    REASONS,
-    OversizeError,
-    WireError,
-    decode,
-    encode,
-    peek_header,
-    size_bound,
-)
+from network.wire import OversizeError, decode, encode, peek_header, size_bound
+from network.wire_fields import MAX_INT, MEASUREMENT_DIMS, MODEL_DIMS, REASONS, WireError
 
 VECTORS = Path(__file__).parents[1] / "vectors" / "v1.json"
 EYE = np.eye(3)

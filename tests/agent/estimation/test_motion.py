@@ -31,7 +31,7 @@ from agent.estimation.motion import (
     split_increment,
     velocity_step,
 )
-from network.wire import MODEL_DIMS
+from network.wire_fields import MODEL_DIMS
 
 Array = NDArray[np.float64]
 

@@ -40,7 +40,7 @@ from agent.estimation.observation import (
 from agent.estimation.unscented import observe
 from agent.events import Observation
 from network.messages import NO_MOUNT, Measurement, Mount
-from network.wire import MEASUREMENT_DIMS
+from network.wire_fields import MEASUREMENT_DIMS
 
 Array = NDArray[np.float64]
 
