@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from network.messages import (
     MAX_ECHOES,
+    MAX_JOINT_DIM,
     MAX_LINES,
     MAX_MESSAGE_BYTES,
     MAX_TARGETS,
@@ -33,6 +34,9 @@ from network.messages import (
     PairRequest,
     ReplyStatus,
     Snapshot,
+    SplitReply,
+    SplitRequest,
+    SplitSnapshot,
     TargetBelief,
 )
 from network.wire import OversizeError, decode, encode, peek_header, size_bound
@@ -76,12 +80,22 @@ def example_spatial_request() -> PairRequest:
     return PairRequest(Epoch(1_000, "r1", 10), (pixel,), snapshot)
 
 
+def example_split(private: bool = True) -> SplitSnapshot:
+    """A robot and a target that are correlated."""
+    cov = np.diag([0.25, 0.5, 0.01, 2.0, 2.0, 1.0, 1.0])
+    cov[0, 3] = cov[3, 0] = 0.125
+    own = np.diag([0.125, 0.25, 0.005, 0.0, 0.0, 0.0, 0.0]) if private else None
+    return SplitSnapshot("unicycle", (("t1", "constant_velocity"),), np.arange(7.0) / 4, cov, own)
+
+
 EXAMPLES: dict[str, Body] = {
     "hello": Hello("0.1.0", (ClockEcho("r2", 10, 20), ClockEcho("r3", 30, 40))),
     "pair_request": example_request(),
     "pair_request_spatial": example_spatial_request(),
     "pair_reply": PairReply(Epoch(1_000, "r2", 9), ReplyStatus.OK, example_snapshot()),
     "pair_reply_too_old": PairReply(Epoch(1_000, "r2", 9), ReplyStatus.TOO_OLD),
+    "split_request": SplitRequest(Epoch(1_000, "r1", 9), example_request().measurements, example_split()),
+    "split_reply": SplitReply(Epoch(1_000, "r2", 9), example_split(private=False)),
 }
 
 
@@ -154,9 +168,20 @@ def snapshots(draw: st.DrawFn) -> Snapshot:
 
 
 @st.composite
+def split_snapshots(draw: st.DrawFn) -> SplitSnapshot:
+    models = sorted(MODEL_DIMS)
+    model, names = draw(st.sampled_from(models)), draw(st.lists(ids, max_size=2, unique=True))
+    targets = tuple((name, draw(st.sampled_from(models))) for name in names)
+    n = MODEL_DIMS[model] + sum(MODEL_DIMS[item] for _, item in targets)
+    share = draw(st.one_of(st.none(), st.floats(0.0, 1.0)))
+    cov = draw(covariances(n))
+    return SplitSnapshot(model, targets, draw(arrays(n)), cov, None if share is None else share * cov)
+
+
+@st.composite
 def messages(draw: st.DrawFn) -> Message:
     header = Header(draw(ids), *(draw(stamps) for _ in range(5)))
-    kind = draw(st.sampled_from(["hello", "request", "reply"]))
+    kind = draw(st.sampled_from(["hello", "request", "reply", "split request", "split reply"]))
     body: Body
     if kind == "hello":
         peers = sorted(draw(st.lists(ids, max_size=MAX_ECHOES, unique=True)))
@@ -168,6 +193,12 @@ def messages(draw: st.DrawFn) -> Message:
         epoch = Epoch(draw(stamps), header.source, draw(stamps))
         measured = draw(st.lists(measurements(), min_size=1, max_size=2))
         body = PairRequest(epoch, tuple(measured), draw(snapshots()))
+    elif kind == "split request":
+        epoch = Epoch(draw(stamps), header.source, draw(stamps))
+        measured = draw(st.lists(measurements(), min_size=1, max_size=2))
+        body = SplitRequest(epoch, tuple(measured), draw(split_snapshots()))
+    elif kind == "split reply":
+        body = SplitReply(draw(epochs), draw(split_snapshots()))
     else:
         status = draw(st.sampled_from(ReplyStatus))
         body = PairReply(draw(epochs), status, draw(snapshots()) if status is ReplyStatus.OK else None)
@@ -215,6 +246,10 @@ def snapshot_with(**changes: Any) -> PairReply:
     return PairReply(Epoch(1_000, "r2", 9), ReplyStatus.OK, snapshot)
 
 
+def split_with(**changes: Any) -> SplitReply:
+    return SplitReply(Epoch(1_000, "r2", 9), dataclasses.replace(example_split(), **changes))
+
+
 def test_too_many_lines_and_targets_for_one_datagram_are_an_oversize_error() -> None:
     lines = tuple(Line(Epoch(500 + k, "r1", k), EYE) for k in range(MAX_LINES))
     belief = Belief("constant_velocity", np.zeros(4), np.eye(4))
@@ -241,6 +276,14 @@ def test_too_many_lines_and_targets_for_one_datagram_are_an_oversize_error() -> 
         PairReply(NEVER, ReplyStatus.BUSY),
         PairRequest(Epoch(1, "r2", 1), example_request().measurements, example_snapshot()),
         PairRequest(Epoch(1, "r1", 1), (), example_snapshot()),
+        SplitReply(NEVER, example_split()),
+        SplitRequest(Epoch(1, "r2", 1), example_request().measurements, example_split()),
+        SplitRequest(Epoch(1, "r1", 1), (), example_split()),
+        split_with(private=2.0 * example_split().cov),
+        split_with(private=-np.eye(7)),
+        split_with(cov=-np.eye(7), private=None),
+        split_with(targets=(("t1", "hovercraft"),)),
+        split_with(targets=(("t1", "unicycle"),)),
         Hello("spaces and <markup>"),
         Hello("1", (ClockEcho("r2", 1, 1), ClockEcho("r2", 1, 1))),
         Hello("1", (ClockEcho("r2", -1, 1),)),
@@ -336,6 +379,25 @@ SPOILED = {
     "too many lines": (put("pair_reply", (2, 2, 5), [0] * (MAX_LINES + 1)), "out_of_range"),
     "a bad target id": (put("pair_reply", (2, 2, 6, 0, 0), "T/1"), "bad_id"),
     "known as a number": (put("pair_reply", (2, 2, 7), 1), "wrong_type"),
+    "a split of a robot nobody knows": (put("split_reply", (2, 1, 0), "hovercraft"), "unknown_model"),
+    "a target of a model nobody knows": (put("split_reply", (2, 1, 1, 0, 1), "hovercraft"), "unknown_model"),
+    "a target named twice": (put("split_reply", (2, 1, 1), [["t", "unicycle"]] * 2), "malformed"),
+    "more targets than a belief may have": (
+        put("split_reply", (2, 1, 1), [[f"t{k}", "unicycle"] for k in range(MAX_JOINT_DIM // 3)]),
+        "out_of_range",
+    ),
+    "a joint mean of another size": (put("split_reply", (2, 1, 2), doubles(1.0, 2.0, 3.0)), "malformed"),
+    "more private than there is": (
+        put("split_request", (2, 2, 4), doubles(*np.diag([9.0, 0, 0, 0, 0, 0, 0])[np.triu_indices(7)])),
+        "not_positive_definite",
+    ),
+    "less private than nothing": (
+        put("split_request", (2, 2, 4), doubles(*(-1e-3 * np.eye(7))[np.triu_indices(7)])),
+        "not_positive_definite",
+    ),
+    "private of another size": (put("split_request", (2, 2, 4), doubles(1.0)), "malformed"),
+    "a split contact that never met": (put("split_reply", (2, 0), [0, "", 0]), "out_of_range"),
+    "a split request for another": (put("split_request", (2, 0, 1), "r2"), "source_mismatch"),
     "an unknown status": (put("pair_reply", (2, 1), 9), "out_of_range"),
     "a refusal with a snapshot": (put("pair_reply", (2, 1), 1), "malformed"),
     "a success without a snapshot": (put("pair_reply", (2, 2), None), "malformed"),
