@@ -120,12 +120,15 @@ class JointModel:
 
     def absolute(self, state: JointState, model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> Used:
         """Use information about the own state alone."""
-        return self._measured(state, model, z, R, list(range(self._own.stop)), 1.0)
+        return self._measured(state, model, z, R, self._own, 1.0)
 
     def sighting(self, state: JointState, target: str, model: RelativeModel, z: Array, R: Array) -> Used:
         """Use a relative measurement of a target of `state.tracks`."""
         block = self.blocks(state)[state.tracks.index(target)]
-        part = [*range(self._own.stop), *range(block.start, block.stop)]
+        # The first track follows the own state.
+        part: slice | list[int] = slice(0, block.stop)
+        if block.start != self._own.stop:
+            part = [*range(self._own.stop), *range(block.start, block.stop)]
         return self._measured(state, model, z, R, part, RESIDUAL_FACTOR)
 
     def _measured(
@@ -134,15 +137,16 @@ class JointModel:
         model: AbsoluteModel | RelativeModel,
         z: Array,
         R: Array,
-        part: list[int],
+        part: slice | list[int],
         residual_factor: float,
     ) -> Used:
         cov = state.cov
+        square = (part, part) if isinstance(part, slice) else np.ix_(part, part)
         predicted = observe(
             model.h,
             model.jacobian,
             state.mean[part],
-            cov[np.ix_(part, part)],
+            cov[square],
             model.angles,
             self._transform,
             self._parameters,

@@ -42,8 +42,8 @@ from network.messages import (
 from network.wire_fields import (
     BELIEF_FLOOR,
     FULL,
-    PART_FLOOR,
     WireError,
+    is_part,
     pack_array,
     pack_belief,
     pack_cov,
@@ -311,9 +311,7 @@ def _split(raw: Any) -> SplitSnapshot:
     private = None
     if private_raw is not None:
         private = read_array(private_raw, n * (n + 1) // 2)[FULL[n]]
-        # Neither part may be negative: what is private is within the whole, and what is left is shared.
-        floor = -PART_FLOOR * cov.diagonal().max()
-        if np.linalg.eigvalsh(private)[0] < floor or np.linalg.eigvalsh(cov - private)[0] < floor:
+        if not is_part(private, cov):
             raise WireError("not_positive_definite")
     return SplitSnapshot(model, tuple(targets), read_array(mean, n), cov, private)
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf
 
 from network.messages import MAX_JOINT_DIM, NEVER, Array, Belief, Epoch, Measurement
 
@@ -182,10 +183,9 @@ def read_cov(raw: Any, n: int, floor: float, below: str) -> Array:
             raise WireError("not_positive_definite" if variance <= 0.0 else below)
         return packed.reshape(1, 1)
     cov: Array = packed[FULL[n]]
-    try:
-        root = np.linalg.cholesky(cov)
-    except np.linalg.LinAlgError:
-        raise WireError("not_positive_definite") from None
+    root, info = dpotrf(cov, lower=1)
+    if info != 0:
+        raise WireError("not_positive_definite")
     if root.diagonal().min() ** 2 < floor:
         raise WireError(below)
     return cov
@@ -227,6 +227,12 @@ def read_measurement(raw: Any) -> Measurement:
     x, y, up, roll, pitch, yaw = read_array(mount, 6).tolist()
     cov = read_cov(R, dim, SENSOR_FLOOR, "below_sensor_floor")
     return Measurement(kind, read_array(z, dim), cov, (x, y, up, roll, pitch, yaw))
+
+
+def is_part(part: Array, whole: Array) -> bool:
+    """Whether a symmetric matrix (n, n) is a part of a covariance: neither it nor what is left is negative."""
+    slack = PART_FLOOR * float(whole.diagonal().max()) * np.eye(len(whole))
+    return all(dpotrf(item + slack, lower=1)[1] == 0 for item in (part, whole - part))
 
 
 def read_dim(model: Any) -> int:

@@ -277,7 +277,7 @@ class SimulatedWorld:
                 intrinsics,
             )
             joint = state if subject is None else np.concatenate([state, place])
-            distance = float(replace(model, kind="range").h(joint)[0])
+            distance = model.distance(joint)
             if distance < sensor.min_range_m or (sensor.max_range_m is not None and distance > sensor.max_range_m):
                 continue
             if sensor.fov_rad is not None:

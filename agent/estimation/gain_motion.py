@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from agent.estimation.gaussian import wrap
 from agent.estimation.heading_moments import moved_in_its_frame
-from agent.estimation.motion import PLANAR, UNICYCLE_GAINS, RobotMotion, StateLayout
+from agent.estimation.motion import PLANAR_SQUARE, UNICYCLE_GAINS, RobotMotion, StateLayout
 from agent.estimation.unscented import Propagated, Transform
 
 Array = NDArray[np.float64]
@@ -76,7 +76,7 @@ class GainMotion(RobotMotion):
         transform: Transform,
     ) -> Propagated:
         increment = delta[[0, 1, 3]]
-        noise = delta_cov[np.ix_(PLANAR, PLANAR)]
+        noise = delta_cov[PLANAR_SQUARE]
         walked = np.zeros((5, 5))
         walked[ALONG, ALONG] = walked[TURN, TURN] = self.walk**2 * dt_s
         if transform == "jacobian":

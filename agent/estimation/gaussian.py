@@ -1,13 +1,19 @@
-"""Gaussian algebra shared by every estimator. Arrays are float64; kernels broadcast over leading axes."""
+"""Gaussian algebra shared by every estimator. Arrays are float64; kernels broadcast over leading axes.
+
+Single matrices go to LAPACK directly: for a handful of components numpy's own checks take longer than the algebra.
+"""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dgesv, dpotrf
 
 Array = NDArray[np.float64]
 
-TWO_PI = 2.0 * np.pi
+TWO_PI = 2.0 * math.pi
 LOWEST = -float(np.nextafter(np.pi, 0.0))
 """The smallest wrapped angle: -pi itself is the same direction as pi."""
 
@@ -19,8 +25,17 @@ def wrap(angle: Array) -> Array:
     return wrapped
 
 
+def wrap_scalar(angle: float) -> float:
+    """One angle [rad] mapped to (-pi, pi], as `wrap` does."""
+    return max(math.pi - (math.pi - angle) % TWO_PI, LOWEST)
+
+
 def wrap_components(vector: Array, angles: tuple[int, ...]) -> Array:
     """`vector` (..., n) with the components `angles` wrapped; returns the same array, changed in place."""
+    if vector.ndim == 1:
+        for index in angles:
+            vector[index] = wrap_scalar(vector.item(index))
+        return vector
     for index in angles:
         vector[..., index] = wrap(vector[..., index])
     return vector
@@ -33,13 +48,7 @@ def symmetrize(matrix: Array) -> Array:
 
 def is_positive_definite(matrix: Array) -> bool:
     """Whether one symmetric matrix (n, n) is finite and has a Cholesky factor."""
-    if not np.all(np.isfinite(matrix)):
-        return False
-    try:
-        np.linalg.cholesky(matrix)
-    except np.linalg.LinAlgError:
-        return False
-    return True
+    return math.isfinite(matrix.sum()) and dpotrf(matrix, lower=1)[1] == 0
 
 
 def square_root(cov: Array) -> Array:
@@ -49,6 +58,10 @@ def square_root(cov: Array) -> Array:
     eigenvector factor. Raises `numpy.linalg.LinAlgError` when `cov` is indefinite beyond rounding: a
     covariance is never repaired silently.
     """
+    if cov.ndim == 2:
+        root, info = dpotrf(cov, lower=1)
+        if info == 0 and math.isfinite(root.sum()):
+            return np.asarray(root)
     try:
         return np.asarray(np.linalg.cholesky(cov), dtype=np.float64)
     except np.linalg.LinAlgError:
@@ -59,14 +72,28 @@ def square_root(cov: Array) -> Array:
         return np.asarray(vectors * np.sqrt(np.clip(values, 0.0, None))[..., None, :])
 
 
+def _solved(matrix: Array, right: Array) -> Array:
+    """matrix^-1 right for one matrix (m, m). Raises `numpy.linalg.LinAlgError` if it is singular."""
+    if len(matrix) == 1 and matrix[0, 0] != 0.0:
+        return np.asarray(right / matrix[0, 0])
+    _, _, solution, info = dgesv(matrix, right)
+    if info != 0:
+        raise np.linalg.LinAlgError("Singular matrix")
+    return np.asarray(solution)
+
+
 def quadratic_form(vector: Array, cov: Array) -> Array:
     """v^T P^-1 v for v (..., n), P (..., n, n): the NEES of an error or the NIS of an innovation."""
+    if vector.ndim == 1:
+        return np.asarray(vector @ _solved(cov, vector))
     solved = np.linalg.solve(cov, vector[..., None])
     return np.asarray((vector[..., None, :] @ solved)[..., 0, 0])
 
 
 def gain(cross: Array, innovation_cov: Array) -> Array:
     """C S^-1 for C (..., n, m) and symmetric S (..., m, m): a Kalman gain, or P+ P^-1, or an inferred Jacobian."""
+    if cross.ndim == 2 and innovation_cov.ndim == 2:
+        return np.asarray(_solved(innovation_cov, cross.T).T)
     return np.asarray(np.linalg.solve(innovation_cov, cross.swapaxes(-1, -2)).swapaxes(-1, -2))
 
 

@@ -15,10 +15,12 @@ wider than about a radian lie turns apart and alias: covariances of the position
 
 from __future__ import annotations
 
+import cmath
+
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import symmetrize, wrap
+from agent.estimation.gaussian import symmetrize, wrap_scalar
 from agent.estimation.unscented import Propagated
 
 Array = NDArray[np.float64]
@@ -34,40 +36,47 @@ def moved_in_its_frame(
     what the turn is longer. The mean's heading is wrapped.
     """
     n, dyaw, u = len(mean), float(delta[-1]), complex(delta[0], delta[1])
-    lean, scale, V, C = np.zeros(n), 1.0, 0.0, 0.0
-    lean[heading] = 1.0
-    phi, turned = float(mean[heading]), dyaw
+    scale, V, C = 1.0, 0.0, 0.0
+    phi, turned, s2 = float(mean[heading]), dyaw, float(cov[heading, heading])
     if gains is not None:
         along, turn = gains
+        lean = np.zeros(n)
+        lean[heading] = 1.0
         lean[turn] = 0.5 * dyaw
         phi += 0.5 * dyaw * (float(mean[turn]) - 1.0)
         scale, turned = float(mean[along]), dyaw * float(mean[turn])
-        V, C = float(cov[along, along]), float(cov[along] @ lean)
-    s2 = float(lean @ cov @ lean)
-    direction = np.exp(1j * phi - 0.5 * s2)
+        V, C, s2 = float(cov[along, along]), float(cov[along] @ lean), float(lean @ cov @ lean)
+    direction = cmath.exp(1j * phi - 0.5 * s2)
     first = (scale + 1j * C) * direction
 
     moved, F = mean.copy(), np.eye(n)
     step = u * first
     moved[:2] += (step.real, step.imag)
-    moved[heading] = wrap(moved[heading] + turned)
-    gradient = 1j * step * lean
-    if gains is not None:
+    moved[heading] = wrap_scalar(float(mean[heading]) + turned)
+    slope = 1j * step
+    if gains is None:
+        F[0, heading], F[1, heading] = slope.real, slope.imag
+        linear = _real(s2 * abs(slope) ** 2, s2 * slope**2)
+    else:
+        gradient = slope * lean
         gradient[along] += u * direction
         F[heading, turn] = dyaw
-    F[0] += gradient.real
-    F[1] += gradient.imag
+        F[0] += gradient.real
+        F[1] += gradient.imag
+        rows = np.array([gradient.real, gradient.imag])
+        linear = rows @ cov @ rows.T
     new = F @ cov @ F.T
     # What the step's own spread has beyond its part that is linear in the state.
     spread = abs(u) ** 2 * (scale**2 + V) - abs(step) ** 2
-    pseudo = u**2 * ((scale + 2j * C) ** 2 + V) * np.exp(2j * phi - 2.0 * s2) - step**2
-    linear = np.array([gradient.real, gradient.imag])
-    new[:2, :2] += _real(spread, pseudo) - linear @ cov @ linear.T
+    pseudo = u**2 * ((scale + 2j * C) ** 2 + V) * cmath.exp(2j * phi - 2.0 * s2) - step**2
+    new[:2, :2] += _real(spread, pseudo) - linear
 
     width = float(cov[heading, heading])
-    body = np.exp(1j * mean[heading] - 0.5 * width)
-    pseudo = (noise[0, 0] - noise[1, 1] + 2j * noise[0, 1]) * np.exp(2j * mean[heading] - 2.0 * width)
-    new[:2, :2] += _real(noise[0, 0] + noise[1, 1], pseudo)
+    facing = float(mean[heading])
+    body = cmath.exp(1j * facing - 0.5 * width)
+    forward, lateral, both = float(noise[0, 0]), float(noise[1, 1]), float(noise[0, 1])
+    pseudo = (forward - lateral + 2j * both) * cmath.exp(2j * facing - 2.0 * width)
+    new[:2, :2] += _real(forward + lateral, pseudo)
     others = [heading] if len(delta) == 3 else [2, heading]
     for row, other in enumerate(others, start=2):
         across = body * complex(noise[0, row], noise[1, row])

@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 PLANAR = (0, 1, 3)
 """Components of an odometry increment (dx, dy, dz, dyaw) that move a planar pose."""
 
+PLANAR_SQUARE = np.ix_(PLANAR, PLANAR)
+
 
 @dataclass(frozen=True, slots=True)
 class StateLayout:
@@ -114,7 +116,7 @@ def advance(
     x' = x (+) (u + w), w ~ N(0, Q): UT-CLAT eq. 9-12 with the increment in place of control times step.
     """
     increment = delta[[0, 1, 3]]
-    noise = delta_cov[np.ix_(PLANAR, PLANAR)]
+    noise = delta_cov[PLANAR_SQUARE]
     if transform == "jacobian":
         moved = compose(mean, increment)
         dx, dy = moved[0] - mean[0], moved[1] - mean[1]

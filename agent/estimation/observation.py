@@ -274,6 +274,13 @@ class RelativeModel:
             return levelled
         return np.asarray(levelled @ self._placed.turn.T - self._placed.lever)
 
+    def distance(self, state: Array) -> float:
+        """Distance [m] of the subject from the sensor, for one stacked state (n,)."""
+        s = self._between(state)
+        if self._placed.apart:
+            s = self._in_sensor(self._levelled(state, s))
+        return math.hypot(*s.tolist())
+
     def h(self, state: Array) -> Array:
         """Measurement (..., m) of a stacked state (..., n). Raises `OutOfViewError`."""
         s = self._between(state)

@@ -58,11 +58,10 @@ class Split:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SplitUpdate:
-    """Gain K (n, m) of the innovation, the split after it, and the trace cost relative to n before it."""
+    """Gain K (n, m) of the innovation and the split after it."""
 
     K: Array
     split: Split
-    cost: float
 
 
 def update_own(split: Split, H: Array, R: Array) -> SplitUpdate:
@@ -70,8 +69,7 @@ def update_own(split: Split, H: Array, R: Array) -> SplitUpdate:
     P = split.cov
     K = gain(P @ H.T, H @ P @ H.T + R)
     left = np.eye(len(P)) - K @ H
-    after = split.mapped(left, K @ R @ K.T)
-    return SplitUpdate(K, after, float(np.trace(np.linalg.solve(P, after.cov))))
+    return SplitUpdate(K, split.mapped(left, K @ R @ K.T))
 
 
 def _factors(own: float, other: float) -> Array:
@@ -113,4 +111,4 @@ def update_from_peer(own: Split, other: Split, H_own: Array, H_other: Array, R: 
     best = int(np.argmin(cost))
     if not cost[best] < n:
         return None
-    return SplitUpdate(K[best], Split(np.zeros((n, n)), symmetrize(after[best])), float(cost[best]))
+    return SplitUpdate(K[best], Split(np.zeros((n, n)), symmetrize(after[best])))

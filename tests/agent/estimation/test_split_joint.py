@@ -47,7 +47,6 @@ def test_the_bound_holds_for_every_correlation_of_the_shared_errors(seed: int, n
     )
     gap = np.linalg.eigvalsh(found.split.cov - truth)
     assert gap.min() > -1e-8 * max(1.0, np.abs(truth).max()), seed
-    assert found.cost < n
 
 
 def test_the_bound_is_put_to_the_test() -> None:
