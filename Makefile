@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: run test check unit setup check-data clean
+.PHONY: run test check unit setup benchmark check-data clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("cofix needs Python 3.11 or newer: make PYTHON=python3.11") if sys.version_info < (3, 11) else None'
@@ -28,6 +28,11 @@ check: setup
 
 unit: setup
 	$(BIN)/python -P -m pytest tests
+
+# Ratios against public libraries, speed of fleets, memory; measured, never asserted by tests.
+benchmark: setup
+	$(BIN)/python -m pip install -qq --editable '.[benchmarks]'
+	$(BIN)/python -m benchmarks
 
 # make check-data UTIAS7=FOLDER [TIERS=FOLDER]: the tests on recorded data, which is not part of the repository.
 check-data: setup

@@ -96,9 +96,9 @@ class SplitExchange:
             del self._pending[epoch]
         return repeat, len(gone)
 
-    def deadline_ns(self) -> int | None:
-        """When `expired` has something to do next."""
-        return min((pending.deadline_ns for pending in self._pending.values()), default=None)
+    def deadline_ns(self) -> int:
+        """When `expired` has something to do next, if a request waits."""
+        return min(pending.deadline_ns for pending in self._pending.values())
 
     def restarted(self) -> None:
         """The peer began a new life: nothing of the old one will be answered, or asked again."""

@@ -280,6 +280,8 @@ class SplitFilter:
 
     def expire(self, now_ns: int, effects: list[Effect]) -> None:
         for peer, exchange in self._exchanges.items():
+            if not exchange.waiting:
+                continue
             repeat, gone = exchange.expired(now_ns)
             for request in repeat:
                 self._counters["pair.repeated"] += 1
@@ -288,8 +290,8 @@ class SplitFilter:
                 self._counters["pair.timed_out"] += gone
 
     def deadline_ns(self) -> int:
-        found = [exchange.deadline_ns() for exchange in self._exchanges.values()]
-        return min((deadline for deadline in found if deadline is not None), default=FAR_FUTURE_NS)
+        waiting = [exchange.deadline_ns() for exchange in self._exchanges.values() if exchange.waiting]
+        return min(waiting, default=FAR_FUTURE_NS)
 
 
 def _shared(state: JointState) -> JointState:

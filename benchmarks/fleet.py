@@ -15,23 +15,25 @@ import numpy as np
 import tomli_w
 
 from deploy.cli import main as cofix
-from sim.engine import Engine
+from sim.engine import VirtualEngine
 from sim.scenario import Scenario
 from sim.world import SimulatedWorld
 
 
-def scenario(count: int, rate_hz: float, interval_s: float, duration_s: float) -> dict[str, object]:
-    """`count` robots on a ring within reach of each other, ranging their mates once per step; robot 1 has fixes."""
-    robots = []
+def scenario(
+    count: int, rate_hz: float, interval_s: float, duration_s: float, reach_m: float = 1000.0
+) -> dict[str, object]:
+    """`count` robots on a ring, `SPACING_M` apart, that range all within reach once per step; robot 1 has fixes."""
+    robots, radius = [], SPACING_M * count / (2.0 * np.pi)
     for index in range(count):
         angle = 2.0 * np.pi * index / count
-        sensors: dict[str, object] = {"range": {"of": ["peers"], "sigma_m": 0.1, "max_range_m": 8.0}}
+        sensors: dict[str, object] = {"range": {"of": ["peers"], "sigma_m": 0.1, "max_range_m": reach_m}}
         if index == 0:
             sensors["pose"] = {"sigma_m": 0.3, "sigma_rad": 0.05, "rate_hz": 1.0}
         robots.append(
             {
                 "id": f"r{index:02d}",
-                "start": {"pose": [float(10.0 * np.cos(angle)), float(10.0 * np.sin(angle)), float(angle)]},
+                "start": {"pose": [float(radius * np.cos(angle)), float(radius * np.sin(angle)), float(angle)]},
                 "start_sigma": {"position_m": 0.3, "heading_rad": 0.05},
                 "control": {"speed_mps": 0.3, "yaw_rate_radps": 0.1},
                 "noise": {"speed_mps": 0.05, "yaw_rate_radps": 0.01},
@@ -50,6 +52,9 @@ def scenario(count: int, rate_hz: float, interval_s: float, duration_s: float) -
     }
 
 
+SPACING_M = 6.0
+
+
 @dataclass(frozen=True, slots=True)
 class Virtual:
     """Simulated seconds per CPU second, and contacts used per simulated second."""
@@ -61,24 +66,25 @@ class Virtual:
 def virtual(count: int, rate_hz: float, interval_s: float, duration_s: float) -> Virtual:
     """A run in virtual time on one core."""
     made = Scenario.model_validate(scenario(count, rate_hz, interval_s, duration_s))
-    engine = Engine(made, SimulatedWorld(made, 1), 1)
+    engine = VirtualEngine(made, SimulatedWorld(made, 1), 1)
     begin = time.process_time()
     result = engine.run()
     return Virtual(duration_s / (time.process_time() - begin), len(result.contacts) / 2.0 / duration_s)
 
 
 def memory_growth(count: int, rate_hz: float, duration_s: float) -> tuple[float, float]:
-    """(growth of the memory in use over the second half, memory in use at its begin [bytes]), traces of figures left out.
+    """Growth of the memory agents hold over the second half of a run, relative, and that memory at its begin [bytes].
 
     Figures of a whole run are kept by the engine on purpose; agents alone are weighed.
     """
     made = Scenario.model_validate(scenario(count, rate_hz, 0.0, duration_s))
-    engine = Engine(made, SimulatedWorld(made, 1), 1)
+    engine = VirtualEngine(made, SimulatedWorld(made, 1), 1)
     taken: list[int] = []
 
     def progress(step: int, steps: int) -> None:
+        engine.contacts.clear()
         if step in (steps // 2, steps):
-            taken.append(tracemalloc.take_snapshot().filter_traces(AGENTS).statistics("filename").__len__() and _held())
+            taken.append(_held())
 
     tracemalloc.start()
     try:
@@ -108,7 +114,7 @@ def processes(count: int, rate_hz: float, duration_s: float) -> Processes:
     """`cofix run` with one process per robot. Raises `RuntimeError` if it fails."""
     with tempfile.TemporaryDirectory() as folder:
         path, out = Path(folder) / "ring.toml", Path(folder) / "run"
-        path.write_text(tomli_w.dumps(scenario(count, rate_hz, 1.0, duration_s)))
+        path.write_text(tomli_w.dumps(scenario(count, rate_hz, 1.0, duration_s, 1.5 * SPACING_M)))
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as told:
             status = cofix(["run", str(path), "--runtime", "processes", "--out", str(out)])
         if status != 0:

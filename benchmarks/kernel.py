@@ -98,10 +98,11 @@ def stone_soup() -> Step:
     transition = CombinedLinearGaussianTransitionModel([ConstantVelocity(0.01), RandomWalk(0.01)])
     measurement = CartesianToBearingRange(3, (0, 2), np.diag([0.01, 0.01]), translation_offset=np.zeros((2, 1)))
     predictor, updater = UnscentedKalmanPredictor(transition), UnscentedKalmanUpdater(measurement)
-    prior = GaussianState([[4.0], [0.0], [3.0]], COV, timestamp=begin)
-    detection = Detection(np.array([[0.6], [4.9]]), timestamp=end, measurement_model=measurement)
 
     def step() -> object:
+        # Predictions are cached by their prior: equal numbers in a new object are worked out anew.
+        prior = GaussianState([[4.0], [0.0], [3.0]], COV, timestamp=begin)
+        detection = Detection(np.array([[0.6], [4.9]]), timestamp=end, measurement_model=measurement)
         prediction = predictor.predict(prior, timestamp=end)
         return updater.update(SingleHypothesis(prediction, detection))
 

@@ -82,6 +82,11 @@ def _solved(matrix: Array, right: Array) -> Array:
     return np.asarray(solution)
 
 
+def inverse(matrix: Array) -> Array:
+    """P^-1 of one matrix (n, n). Raises `numpy.linalg.LinAlgError` if it is singular."""
+    return _solved(matrix, np.eye(len(matrix)))
+
+
 def quadratic_form(vector: Array, cov: Array) -> Array:
     """v^T P^-1 v for v (..., n), P (..., n, n): the NEES of an error or the NIS of an innovation."""
     if vector.ndim == 1:

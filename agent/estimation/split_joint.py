@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import gain, symmetrize
+from agent.estimation.gaussian import gain, inverse, symmetrize
 
 Array = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ def update_from_peer(own: Split, other: Split, H_own: Array, H_other: Array, R: 
     foreign = symmetrize(H_other @ other.private @ H_other.T + R)
     known = symmetrize(H_own @ own.private @ H_own.T) + foreign
     C_private, C_shared = own.private @ H_own.T, own.shared @ H_own.T
-    metric = np.linalg.inv(own.cov)
+    metric = inverse(own.cov)
     factors = _factors(float(np.trace(shared_own)), float(np.trace(shared_other)))
     f_own, f_other = factors[:, 0, None, None], factors[:, 1, None, None]
     # One candidate per leading index.
@@ -103,12 +103,13 @@ def update_from_peer(own: Split, other: Split, H_own: Array, H_other: Array, R: 
     left = np.eye(n) - K @ H_own
     left_T, K_T = left.swapaxes(-1, -2), K.swapaxes(-1, -2)
     X, Y = left @ own.shared @ left_T, K @ shared_other @ K_T
-    sx = np.sqrt(np.maximum(np.sum(metric * X, axis=(-2, -1)), 0.0))
-    sy = np.sqrt(np.maximum(np.sum(metric * Y, axis=(-2, -1)), 0.0))
-    ratio = np.clip(sy / np.maximum(sx, SMALLEST), 1.0 / WIDEST, WIDEST)[:, None, None]
+    traces = metric.ravel()
+    sx = np.sqrt(np.maximum(X.reshape(len(X), -1) @ traces, 0.0))
+    sy = np.sqrt(np.maximum(Y.reshape(len(Y), -1) @ traces, 0.0))
+    ratio = np.minimum(np.maximum(sy / np.maximum(sx, SMALLEST), 1.0 / WIDEST), WIDEST)[:, None, None]
     after = X * (1.0 + ratio) + Y * (1.0 + 1.0 / ratio) + left @ own.private @ left_T + K @ foreign @ K_T
-    cost = np.sum(metric * after, axis=(-2, -1))
-    best = int(np.argmin(cost))
+    cost = after.reshape(len(after), -1) @ traces
+    best = int(cost.argmin())
     if not cost[best] < n:
         return None
     return SplitUpdate(K[best], Split(np.zeros((n, n)), symmetrize(after[best])))
