@@ -1,0 +1,104 @@
+"""A robot and its targets as one belief: a Kalman filter of the joint state while nobody else is met."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from numpy.typing import NDArray
+
+from agent.estimation.motion import CONSTANT_VELOCITY, TargetMotion
+from agent.estimation.observation import RelativeModel, absolute_model
+from agent.joint_state import JointModel
+from agent.settings import NS, AgentSettings, LocalizationSettings, TargetSettings
+
+Array = NDArray[np.float64]
+
+TINY = 1e-12
+HEADING = 0.4
+MOTION = TargetMotion(CONSTANT_VELOCITY, noise_sigma=(0.2, 0.2))
+STEP = np.array([0.3, 0.1, 0.0, 0.0])
+NOISE = np.diag([0.02, 0.02, 0.0, 0.0])
+
+
+def model(transform: str, names: tuple[str, ...] = ("t1",)) -> JointModel:
+    targets = tuple(TargetSettings(name, MOTION, np.array([4.0, 3.0, 0.2, -0.1]), np.eye(4)) for name in names)
+    localization = LocalizationSettings(transform=transform, innovation_cap=0.0)  # type: ignore[arg-type]
+    start = np.array([1.0, 2.0, HEADING])
+    return JointModel(
+        AgentSettings("r1", 0, start, np.diag([0.3, 0.2, TINY]), targets=targets, localization=localization)
+    )
+
+
+@pytest.mark.parametrize("transform", ["unscented", "jacobian"])
+def test_alone_it_is_the_kalman_filter_of_robot_and_target(transform: str) -> None:
+    subject = model(transform)
+    state = subject.initial()
+    library = KalmanFilter(dim_x=6, dim_z=2)
+    library.x = state.mean[[0, 1, 3, 4, 5, 6], None].copy()
+    library.P = np.diag([0.3, 0.2, 1.0, 1.0, 1.0, 1.0])
+    F = np.eye(6)
+    F[2, 4] = F[3, 5] = 1.0
+    turn = np.array([[np.cos(HEADING), -np.sin(HEADING)], [np.sin(HEADING), np.cos(HEADING)]])
+    Q = np.zeros((6, 6))
+    Q[:2, :2] = turn @ NOISE[:2, :2] @ turn.T
+    Q[2:, 2:] = MOTION.drift(np.zeros(4), np.zeros((4, 4)), 1.0, "jacobian").cov
+    seen = np.hstack([-turn.T, turn.T, np.zeros((2, 2))])
+    fixed = np.hstack([np.eye(2), np.zeros((2, 4))])
+    rng = np.random.default_rng(3)
+    for k in range(1, 15):
+        state = subject.moved(state, k * NS, STEP, NOISE)
+        library.F, library.Q = F, Q
+        library.predict()
+        library.x[:2, 0] += turn @ STEP[:2]
+        R = np.diag([0.05, 0.08])
+        if k % 3 == 0:
+            z = state.mean[:2] + rng.normal(size=2)
+            found = absolute_model("position", AgentSettings("r", 0, np.zeros(3), np.eye(3)).layout, z, R)
+            assert found is not None
+            state = subject.absolute(state, *found).state
+            library.update(z[:, None], R, fixed)
+        else:
+            z = turn.T @ (state.mean[3:5] - state.mean[:2]) + 0.2 * rng.normal(size=2)
+            sensor = RelativeModel("vector", model(transform)._settings.layout, subject=CONSTANT_VELOCITY)
+            state = subject.sighting(state, "t1", sensor, z, R).state
+            library.update(z[:, None], R, seen)
+        keep = [0, 1, 3, 4, 5, 6]
+        assert np.abs(state.mean[keep] - library.x[:, 0]).max() < 1e-6
+        assert np.abs(state.cov[np.ix_(keep, keep)] - library.P).max() < 1e-6
+
+
+def test_own_noise_is_private_and_what_all_know_of_a_target_is_shared() -> None:
+    subject = model("unscented")
+    state = subject.moved(subject.initial(), NS, STEP, NOISE)
+    assert not state.split.private[3:].any()
+    assert not state.split.shared[:3].any()
+    assert np.linalg.eigvalsh(state.split.private)[-1] > 0.2
+    assert np.linalg.eigvalsh(state.split.shared)[-1] > 1.0
+
+
+def test_tracks_are_told_and_found_by_name() -> None:
+    """Robots that track different targets, or in another order, share what both have."""
+    mine, theirs = model("unscented", ("t1", "t2", "t3")), model("unscented", ("t3", "t1"))
+    told = theirs.snapshot(theirs.initial(), ("t3", "t1"))
+    state = mine.initial()
+    assert mine._common(state, told) == [(slice(11, 15), slice(3, 7)), (slice(3, 7), slice(7, 11))]
+    only = mine.snapshot(state, ("t2",))
+    assert only.targets == (("t2", "constant_velocity"),)
+    assert np.array_equal(only.mean, np.concatenate([state.mean[:3], state.mean[7:11]]))
+    assert np.array_equal(only.cov, state.cov[np.ix_([*range(3), *range(7, 11)], [*range(3), *range(7, 11)])])
+
+
+def test_an_innovation_beyond_the_cap_counts_less() -> None:
+    settings = model("unscented")._settings
+    capped = JointModel(
+        AgentSettings(
+            "r1", 0, settings.mean, settings.cov, localization=LocalizationSettings(innovation_cap=9.0), track=False
+        )
+    )
+    found = absolute_model("position", settings.layout, settings.mean[:2] + 30.0, 0.01 * np.eye(2))
+    assert found is not None
+    free = model("unscented").absolute(model("unscented").initial(), *found)
+    used = capped.absolute(capped.initial(), *found)
+    assert used.nis > 9.0
+    assert np.trace(used.state.cov[:2, :2]) > 2.0 * np.trace(free.state.cov[:2, :2])
