@@ -14,7 +14,7 @@ from deploy.cli import parser
 from sim.scenario import bundled, load
 
 ROOT = Path(__file__).resolve().parents[2]
-DOCUMENTS = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "docs" / "interfaces.md")
+DOCUMENTS = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
 PLACEHOLDERS = {"NAME-TIME": "demo-1", "CONFIG": "r1.toml", "FOLDER_OF_MRCLAM_Dataset7": "folder"}
 
 
