@@ -42,6 +42,9 @@ WORLD = "world"
 # that passed through TIMESYNC are off by so much.
 SETTLE_WALL_S = 0.015
 STAMP_WALL_S = 0.0015
+LEASE_MS, LEASE_PER_ROBOT_MS = 1_000, 250
+"""Many processes that start on one computer are slow at first: links that are given up too soon are opened again and
+again, and with forty of them that takes all the time there is."""
 
 
 class LaunchError(RuntimeError):
@@ -115,6 +118,7 @@ def agent_file(
         "zenoh": {
             "listen": endpoints[robot.id],
             "peers": [{"id": name, "endpoints": value} for name, value in endpoints.items() if name != robot.id],
+            "lease_ms": max(LEASE_MS, LEASE_PER_ROBOT_MS * len(endpoints)),
         },
         "mavlink": mavlink,
         "injection": {

@@ -36,7 +36,7 @@ class ZenohSettings:
 
     connect      (peer id, its endpoints); only peers whose id sorts below `robot` are dialled
     boot_id      part of the liveliness key, so that a restart within the lease is seen
-    lease_ms     a neighbour unheard for so long is gone (wall time)
+    lease_ms     a neighbour unheard for so long is gone (wall time); links that are opened are waited for as long
     queue_depth  packets waiting for the event loop; beyond it the oldest is dropped and counted
     """
 
@@ -46,7 +46,6 @@ class ZenohSettings:
     listen: tuple[str, ...]
     connect: tuple[tuple[str, tuple[str, ...]], ...] = ()
     lease_ms: int = 1_000
-    open_timeout_ms: int = 1_000
     queue_depth: int = 1_024
     close_timeout_s: float = 12.0
 
@@ -54,7 +53,7 @@ class ZenohSettings:
         for name in ("fleet", "robot"):
             if not valid_id(getattr(self, name)):
                 raise ValueError(f"{name} must match [a-z0-9-]{{1,24}}")
-        for name in ("lease_ms", "open_timeout_ms", "queue_depth", "close_timeout_s"):
+        for name in ("lease_ms", "queue_depth", "close_timeout_s"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be positive")
 
@@ -261,7 +260,11 @@ def _config(settings: ZenohSettings) -> zenoh.Config:
         "mode": "peer",
         "listen/endpoints": list(settings.listen),
         "connect/endpoints": settings.dialled(),
-        "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
+        "connect/retry": {
+            "period_init_ms": max(settings.lease_ms // 10, 1),
+            "period_max_ms": max(settings.lease_ms // 2, 1),
+            "period_increase_factor": 1.5,
+        },
         "scouting/delay": 0,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
@@ -269,8 +272,8 @@ def _config(settings: ZenohSettings) -> zenoh.Config:
         "transport/link/tx/keep_alive": 4,
         "transport/unicast/max_links": 2,
         # A lost handshake datagram is not repeated and would cost the whole default of ten seconds.
-        "transport/unicast/open_timeout": settings.open_timeout_ms,
-        "transport/unicast/accept_timeout": settings.open_timeout_ms,
+        "transport/unicast/open_timeout": settings.lease_ms,
+        "transport/unicast/accept_timeout": settings.lease_ms,
         "transport/shared_memory/enabled": False,
     }
     config = zenoh.Config()
