@@ -28,6 +28,7 @@ from agent.control import ControlLine
 from agent.effects import Estimate
 from agent.events import Event
 from agent.fleet_clock import FleetClock
+from agent.lateness_figures import LatenessFigures
 from agent.mavlink import MavlinkError, MavlinkLink
 from agent.node import Node, Outgoing, rejected
 from agent.recording import RecordingWriter
@@ -74,7 +75,7 @@ class AgentShell:
         self._timer: asyncio.TimerHandle | None = None
         self._timer_due_ns = self._timer_set_ns = self._start_ns = 0
         self._published_s = 0.0
-        self._lag_ns = 0
+        self._lags = LatenessFigures()
         self._stop = asyncio.Event()
         self.counters: Counter[str] = Counter()
         self._incarnation = 1
@@ -255,7 +256,7 @@ class AgentShell:
         assert self._node is not None
         now_ns = self._clock.now_ns()
         self._timer = None
-        self._lag_ns = max(self._lag_ns, now_ns - self._timer_set_ns)
+        self._lags.add(now_ns - self._timer_set_ns)
         self._carry_out(self._node.on_tick(now_ns))
 
     def _carry_out(self, out: Outgoing) -> None:
@@ -291,7 +292,7 @@ class AgentShell:
         status: dict[str, Any] = {"robot": self.robot, **agent.status()}
         status["peers"] = {peer.peer: peer.up for peer in self._node.endpoint.peers()}
         status["rejected"] = rejected(self._node)
-        status["lag_max_s"] = self._lag_ns * 1e-9
+        status["lag_max_s"] = self._lags.max_ns * 1e-9
         injection = self.config.injection
         status["injected"] = injection.links.model_dump(exclude_defaults=True) if injection is not None else {}
         if self._reader is not None:
@@ -309,7 +310,8 @@ class AgentShell:
             "endpoint": dict(self._node.endpoint.counters),
             "transport": dict(self._transport.counters),
             "autopilot": dict(self._reader.counters) if self._reader is not None else {},
-            "lag_max_s": self._lag_ns * 1e-9,
+            "lag_max_s": self._lags.max_ns * 1e-9,
+            "lags": self._lags.told(),
         }
 
     # -- end ------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ import tomli_w
 
 from agent.config import AgentConfig
 from agent.config_file import ConfigError
+from agent.lateness_figures import LatenessFigures
 from agent.node import Recorder
 from agent.recording import RecordingWriter
 from agent.settings import NS
@@ -49,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
     started = time.perf_counter()
     exits: dict[str, int] | None = None
     messages: list[str] = []
-    lag_max_s = 0.0
+    lag_max_s = lag_p99_s = 0.0
     if runtime == "virtual":
         result = _run_virtual(scenario, options, world, run_dir)
     else:
@@ -66,11 +67,16 @@ def run(options: argparse.Namespace) -> int:
             return 1
         exits, messages = outcome.exits, outcome.messages
         lag_max_s = max([f["lag_max_s"] for f in (*outcome.figures.values(), outcome.world) if f], default=0.0)
+        lags = LatenessFigures()
+        for figures in outcome.figures.values():
+            if figures:
+                lags.heard(round(figures["lag_max_s"] * 1e9), figures["lags"])
+        lag_p99_s = lags.percentile_ns(0.99) * 1e-9
         result = collect(scenario, world, run_dir, outcome, options.bound)
         merge_recordings(scenario, run_dir)
         merge_fates(scenario, run_dir)
     steps = sorted(result.step_us)
-    timing = {"wall_s": time.perf_counter() - started, "lag_max_s": lag_max_s}
+    timing = {"wall_s": time.perf_counter() - started, "lag_max_s": lag_max_s, "lag_p99_s": lag_p99_s}
     if steps:
         timing["step_us_median"] = steps[len(steps) // 2]
     summary = summarize(
