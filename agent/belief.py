@@ -98,7 +98,7 @@ class RobotState:
 
     def updated(self, mean: Array, cov: Array, left: Array) -> RobotState:
         """The state after a local update that maps the error by `left` (n, n)."""
-        return replace(self, mean=mean, cov=cov, stack=self.stack.left(left))
+        return RobotState(self.t_ns, mean, cov, self.stack.left(left), self.pairs, self.targets)
 
     def pair(self, peer: str) -> PairRecord:
         return self.pairs.get(peer, NO_PAIR)

@@ -54,10 +54,7 @@ def moved(
         if belief is not None:
             drifted = target.motion.drift(belief.mean, belief.cov, dt_s, localization.transform)
             targets[target.id] = TargetState(drifted.mean, drifted.cov, belief.updated_ns)
-    return (
-        replace(state, t_ns=t_ns, mean=own.mean, cov=own.cov, stack=state.stack.left(own.F), targets=targets),
-        own.F,
-    )
+    return RobotState(t_ns, own.mean, own.cov, state.stack.left(own.F), state.pairs, targets), own.F
 
 
 class History:

@@ -72,7 +72,8 @@ def processes(rate_hz: float, count: int, required: bool = True) -> Result:
     found = fleet.processes(count, rate_hz, 20.0)
     periods = found.lag_p99_s * rate_hz
     note = f"worst lag {found.lag_max_s * 1e3:.0f} ms"
-    return Result(f"{count} processes at {rate_hz:g} Hz: p99 lag / period", periods, "< 1" if required else "", periods < 1.0 if required else None, note)
+    what = f"{count} processes at {rate_hz:g} Hz: p99 lag / period"
+    return Result(what, periods, "< 1" if required else "", periods < 1.0 if required else None, note)
 
 
 def main() -> int:
@@ -88,7 +89,7 @@ def main() -> int:
         fleet_memory,
     ]
     if options.processes:
-        results += [lambda: processes(5.0, options.processes), lambda: processes(10.0, options.processes, required=False)]
+        results += [lambda: processes(5.0, options.processes), lambda: processes(10.0, options.processes, False)]
     failed = False
     for measure in results:
         result = measure()

@@ -75,16 +75,24 @@ def absolute_update(
     predicted = observe(model.h, model.jacobian, mean, cov, model.angles, options.transform, options.parameters)
     innovation = _innovation(predicted, z, model.angles)
     S, nis = _capped(innovation, predicted.cov + R, options.innovation_cap)
-    return _applied(mean, cov, layout, gain(predicted.cross, S), S, innovation, nis)
+    return _applied(mean, cov, layout, gain(predicted.cross, S), S, innovation, nis, predicted.H)
 
 
 def _applied(
-    mean: Array, cov: Array, layout: StateLayout, K: Array, S: Array, innovation: Array, nis: float
+    mean: Array,
+    cov: Array,
+    layout: StateLayout,
+    K: Array,
+    S: Array,
+    innovation: Array,
+    nis: float,
+    H: Array | None = None,
 ) -> Update | None:
+    """`H` spares a solution where K S = P H^T: P+ P^-1 = 1 - K H then."""
     posterior = symmetrize(cov - K @ S @ K.T)
     if not is_positive_definite(posterior):
         return None
-    left = gain(posterior, cov)
+    left = gain(posterior, cov) if H is None else np.eye(len(cov)) - K @ H
     return Update(wrap_components(mean + K @ innovation, layout.angles), posterior, left, nis)
 
 

@@ -51,32 +51,35 @@ def moved_in_its_frame(
 
     moved, F = mean.copy(), np.eye(n)
     step = u * first
-    moved[:2] += (step.real, step.imag)
+    moved[0] += step.real
+    moved[1] += step.imag
     moved[heading] = wrap_scalar(float(mean[heading]) + turned)
     slope = 1j * step
     if gains is None:
         F[0, heading], F[1, heading] = slope.real, slope.imag
-        linear = _real(s2 * abs(slope) ** 2, s2 * slope**2)
+        linear, pseudo_linear = s2 * abs(slope) ** 2, s2 * slope**2
     else:
         gradient = slope * lean
         gradient[along] += u * direction
         F[heading, turn] = dyaw
         F[0] += gradient.real
         F[1] += gradient.imag
-        rows = np.array([gradient.real, gradient.imag])
-        linear = rows @ cov @ rows.T
+        weighted = cov @ gradient
+        linear, pseudo_linear = float((gradient.conj() @ weighted).real), complex(gradient @ weighted)
     new = F @ cov @ F.T
-    # What the step's own spread has beyond its part that is linear in the state.
-    spread = abs(u) ** 2 * (scale**2 + V) - abs(step) ** 2
-    pseudo = u**2 * ((scale + 2j * C) ** 2 + V) * cmath.exp(2j * phi - 2.0 * s2) - step**2
-    new[:2, :2] += _real(spread, pseudo) - linear
+    # What the step's own spread has beyond its part that is linear in the state: E|z|^2 and E z^2 of a complex number.
+    spread = abs(u) ** 2 * (scale**2 + V) - abs(step) ** 2 - linear
+    pseudo = u**2 * ((scale + 2j * C) ** 2 + V) * cmath.exp(2j * phi - 2.0 * s2) - step**2 - pseudo_linear
 
-    width = float(cov[heading, heading])
-    facing = float(mean[heading])
-    body = cmath.exp(1j * facing - 0.5 * width)
+    facing, width = float(mean[heading]), float(cov[heading, heading])
     forward, lateral, both = float(noise[0, 0]), float(noise[1, 1]), float(noise[0, 1])
-    pseudo = (forward - lateral + 2j * both) * cmath.exp(2j * facing - 2.0 * width)
-    new[:2, :2] += _real(forward + lateral, pseudo)
+    spread += forward + lateral
+    pseudo += (forward - lateral + 2j * both) * cmath.exp(2j * facing - 2.0 * width)
+    new[0, 0] += 0.5 * (spread + pseudo.real)
+    new[1, 1] += 0.5 * (spread - pseudo.real)
+    new[0, 1] += 0.5 * pseudo.imag
+    new[1, 0] += 0.5 * pseudo.imag
+    body = cmath.exp(1j * facing - 0.5 * width)
     others = [heading] if len(delta) == 3 else [2, heading]
     for row, other in enumerate(others, start=2):
         across = body * complex(noise[0, row], noise[1, row])
@@ -88,9 +91,3 @@ def moved_in_its_frame(
     if len(delta) == 4:
         moved[2] += delta[2]
     return Propagated(moved, symmetrize(new), F)
-
-
-def _real(spread: float, pseudo: complex) -> Array:
-    """Covariance (2, 2) of real and imaginary part, from E|z|^2 and E z^2 of a complex number of mean zero."""
-    half = 0.5 * pseudo.imag
-    return np.array([[0.5 * (spread + pseudo.real), half], [half, 0.5 * (spread - pseudo.real)]])
