@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from benchmarks import fleet, kernel
+from benchmarks import exchange, fleet, kernel
 
 Step = Callable[[], object]
 
@@ -67,6 +67,15 @@ def engine(name: str, interval_s: float, least: float) -> Result:
     return Result(what, found.speed, f">= {least:g}", found.speed >= least, note)
 
 
+def pair_exchange() -> Result:
+    """Our own time in a pair exchange of two agents over Zenoh, beyond the transport's."""
+    found = exchange.exchange()
+    added_ms = (found.pair_s - found.bare_s) * 1e3
+    sizes = " + ".join(str(size) for size in found.bytes_sent)
+    note = f"{found.pair_s * 1e3:.2f} ms / {found.bare_s * 1e3:.2f} ms, {sizes} bytes"
+    return Result("pair exchange above a bare round trip over Zenoh [ms]", added_ms, "< 1", added_ms < 1.0, note)
+
+
 def processes(rate_hz: float, count: int, required: bool = True) -> Result:
     """Lag of all agents' timers, 99th percentile, in periods."""
     found = fleet.processes(count, rate_hz, 20.0)
@@ -86,6 +95,7 @@ def main() -> int:
         lambda: against("Stone Soup UKF", kernel.stone_soup, 0.1),
         lambda: engine("every contact", 0.0, 5.0),
         lambda: engine("one contact per pair and second", 1.0, 12.0),
+        pair_exchange,
         fleet_memory,
     ]
     if options.processes:
