@@ -99,6 +99,8 @@ def gain(cross: Array, innovation_cov: Array) -> Array:
     """C S^-1 for C (..., n, m) and symmetric S (..., m, m): a Kalman gain, or P+ P^-1, or an inferred Jacobian."""
     if cross.ndim == 2 and innovation_cov.ndim == 2:
         return np.asarray(_solved(innovation_cov, cross.T).T)
+    if innovation_cov.shape[-1] == 1 and innovation_cov.all():
+        return np.asarray(cross / innovation_cov)
     return np.asarray(np.linalg.solve(innovation_cov, cross.swapaxes(-1, -2)).swapaxes(-1, -2))
 
 

@@ -91,25 +91,31 @@ def update_from_peer(own: Split, other: Split, H_own: Array, H_other: Array, R: 
     lowers the trace of P relative to the prior: the belief is better left alone.
     """
     n = len(own.private)
-    shared_own, shared_other = H_own @ own.shared @ H_own.T, H_other @ other.shared @ H_other.T
-    foreign = symmetrize(H_other @ other.private @ H_other.T + R)
-    known = symmetrize(H_own @ own.private @ H_own.T) + foreign
     C_private, C_shared = own.private @ H_own.T, own.shared @ H_own.T
+    own_private, own_shared = H_own @ C_private, symmetrize(H_own @ C_shared)
+    other_shared = symmetrize(H_other @ other.shared @ H_other.T)
+    foreign = H_other @ other.private @ H_other.T + R
+    independent = symmetrize(own_private + foreign)
     metric = inverse(own.cov)
-    factors = _factors(float(np.trace(shared_own)), float(np.trace(shared_other)))
+    factors = _factors(float(own_shared.trace()), float(other_shared.trace()))
     f_own, f_other = factors[:, 0, None, None], factors[:, 1, None, None]
-    # One candidate per leading index.
-    K = gain(C_private + f_own * C_shared, known + f_own * shared_own + f_other * shared_other)
-    left = np.eye(n) - K @ H_own
-    left_T, K_T = left.swapaxes(-1, -2), K.swapaxes(-1, -2)
-    X, Y = left @ own.shared @ left_T, K @ shared_other @ K_T
-    traces = metric.ravel()
-    sx = np.sqrt(np.maximum(X.reshape(len(X), -1) @ traces, 0.0))
-    sy = np.sqrt(np.maximum(Y.reshape(len(Y), -1) @ traces, 0.0))
-    ratio = np.minimum(np.maximum(sy / np.maximum(sx, SMALLEST), 1.0 / WIDEST), WIDEST)[:, None, None]
-    after = X * (1.0 + ratio) + Y * (1.0 + 1.0 / ratio) + left @ own.private @ left_T + K @ foreign @ K_T
-    cost = after.reshape(len(after), -1) @ traces
+    # One candidate per leading index; tr(metric K S K^T) = tr(S G) spares the (n, n) matrices of all but the best.
+    K = gain(C_private + f_own * C_shared, independent + f_own * own_shared + f_other * other_shared)
+    flat = K.reshape(len(K), -1)
+    G = (K.swapaxes(-1, -2) @ (metric @ K)).reshape(len(K), -1)
+    of_shared = float((metric * own.shared).sum())
+    X = np.maximum(of_shared - 2.0 * (flat @ (metric @ C_shared).ravel()) + G @ own_shared.ravel(), 0.0)
+    Y = np.maximum(G @ other_shared.ravel(), 0.0)
+    rest = float((metric * own.private).sum()) - 2.0 * (flat @ (metric @ C_private).ravel()) + G @ independent.ravel()
+    # (sx + sy)^2 is the least of X / w + Y / (1 - w).
+    cost = (np.sqrt(X) + np.sqrt(Y)) ** 2 + rest
     best = int(cost.argmin())
     if not cost[best] < n:
         return None
-    return SplitUpdate(K[best], Split(np.zeros((n, n)), symmetrize(after[best])))
+    ratio = math.sqrt(Y[best] / max(float(X[best]), SMALLEST))
+    ratio = min(max(ratio, 1.0 / WIDEST), WIDEST)
+    K = K[best]
+    left = np.eye(n) - K @ H_own
+    after = left @ (own.shared * (1.0 + ratio) + own.private) @ left.T
+    after += K @ (other_shared * (1.0 + 1.0 / ratio) + foreign) @ K.T
+    return SplitUpdate(K, Split(np.zeros((n, n)), symmetrize(after)))
