@@ -35,9 +35,11 @@ def moved_in_its_frame(
     says where the heading sits, `gains` the gains of forward motion and of turning: the chord then leans by half of
     what the turn is longer. The mean's heading is wrapped.
     """
-    n, dyaw, u = len(mean), float(delta[-1]), complex(delta[0], delta[1])
+    n, steps = len(mean), delta.tolist()
+    dyaw, u = steps[-1], complex(steps[0], steps[1])
     scale, V, C = 1.0, 0.0, 0.0
-    phi, turned, s2 = float(mean[heading]), dyaw, float(cov[heading, heading])
+    facing, width = mean.item(heading), cov.item(heading, heading)
+    phi, turned, s2 = facing, dyaw, width
     if gains is not None:
         along, turn = gains
         lean = np.zeros(n)
@@ -53,7 +55,7 @@ def moved_in_its_frame(
     step = u * first
     moved[0] += step.real
     moved[1] += step.imag
-    moved[heading] = wrap_scalar(float(mean[heading]) + turned)
+    moved[heading] = wrap_scalar(facing + turned)
     slope = 1j * step
     if gains is None:
         F[0, heading], F[1, heading] = slope.real, slope.imag
@@ -71,23 +73,20 @@ def moved_in_its_frame(
     spread = abs(u) ** 2 * (scale**2 + V) - abs(step) ** 2 - linear
     pseudo = u**2 * ((scale + 2j * C) ** 2 + V) * cmath.exp(2j * phi - 2.0 * s2) - step**2 - pseudo_linear
 
-    facing, width = float(mean[heading]), float(cov[heading, heading])
-    forward, lateral, both = float(noise[0, 0]), float(noise[1, 1]), float(noise[0, 1])
-    spread += forward + lateral
-    pseudo += (forward - lateral + 2j * both) * cmath.exp(2j * facing - 2.0 * width)
-    new[0, 0] += 0.5 * (spread + pseudo.real)
-    new[1, 1] += 0.5 * (spread - pseudo.real)
-    new[0, 1] += 0.5 * pseudo.imag
-    new[1, 0] += 0.5 * pseudo.imag
+    Q = noise.tolist()
+    spread += Q[0][0] + Q[1][1]
+    pseudo += (Q[0][0] - Q[1][1] + 2j * Q[0][1]) * cmath.exp(2j * facing - 2.0 * width)
     body = cmath.exp(1j * facing - 0.5 * width)
-    others = [heading] if len(delta) == 3 else [2, heading]
+    added = np.zeros((n, n))
+    added[0, 0], added[1, 1] = 0.5 * (spread + pseudo.real), 0.5 * (spread - pseudo.real)
+    added[0, 1] = added[1, 0] = 0.5 * pseudo.imag
+    others = (heading,) if len(steps) == 3 else (2, heading)
     for row, other in enumerate(others, start=2):
-        across = body * complex(noise[0, row], noise[1, row])
-        new[0, other] += across.real
-        new[1, other] += across.imag
-        new[other, :2] = new[:2, other]
+        across = body * complex(Q[0][row], Q[1][row])
+        added[0, other] = added[other, 0] = across.real
+        added[1, other] = added[other, 1] = across.imag
         for column, another in enumerate(others, start=2):
-            new[other, another] += noise[row, column]
-    if len(delta) == 4:
-        moved[2] += delta[2]
-    return Propagated(moved, symmetrize(new), F)
+            added[other, another] = Q[row][column]
+    if len(steps) == 4:
+        moved[2] += steps[2]
+    return Propagated(moved, symmetrize(new + added), F)
