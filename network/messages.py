@@ -31,6 +31,9 @@ MAX_TARGETS = 8
 MAX_MEASUREMENTS = 8
 MAX_ECHOES = 16
 
+MAX_RECKONINGS = 4
+MAX_RAW_MEASUREMENTS = 16
+"""Of one report to a team; what does not fit goes in another one."""
 
 Mount = tuple[float, float, float, float, float, float]
 """A sensor on a body: lever arm x, y, z [m, FLU], then roll, pitch, yaw [rad], turned in the order yaw, pitch, roll."""
@@ -216,7 +219,50 @@ class SplitReply:
     snapshot: SplitSnapshot
 
 
-Body = Hello | PairRequest | PairReply | SplitRequest | SplitReply
+@dataclass(frozen=True, slots=True, eq=False)
+class Reckoning:
+    """A robot's odometry from `anchor_ns` to `t_ns` as one increment.
+
+    delta (4,) is dx, dy, dz, dyaw (not wrapped) in the body frame at the anchor, cov (4, 4) its covariance, positive
+    semi-definite. Two of one anchor tell the odometry between them, whatever was lost in between.
+    """
+
+    anchor_ns: int
+    t_ns: int
+    delta: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawMeasurement:
+    """What a robot's sensor measured at `t_ns`: z (m,), covariance R (m, m).
+
+    `index` tells apart what the robot measured at one instant. `of` is a robot, `target:ID` or `landmark:ID`, and None
+    of what concerns the robot alone. `mount` as of a `Measurement`.
+    """
+
+    t_ns: int
+    index: int
+    of: str | None
+    kind: str
+    z: Array
+    R: Array
+    mount: Mount = NO_MOUNT
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TeamReport:
+    """Raw data of one robot for its whole team, which hears the newest and those of the instant before.
+
+    `born_ns` is the instant the robot's present life began; reckonings ascend in time.
+    """
+
+    born_ns: int
+    reckonings: tuple[Reckoning, ...]
+    measurements: tuple[RawMeasurement, ...] = ()
+
+
+Body = Hello | PairRequest | PairReply | SplitRequest | SplitReply | TeamReport
 
 
 @dataclass(frozen=True, slots=True, eq=False)

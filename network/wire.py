@@ -38,6 +38,7 @@ from network.messages import (
     SplitRequest,
     SplitSnapshot,
     TargetBelief,
+    TeamReport,
 )
 from network.wire_fields import (
     BELIEF_FLOOR,
@@ -62,8 +63,9 @@ from network.wire_fields import (
     read_measurement,
     read_text,
 )
+from network.wire_team import pack_report, read_report
 
-_HELLO, _PAIR_REQUEST, _PAIR_REPLY, _SPLIT_REQUEST, _SPLIT_REPLY = 1, 2, 3, 4, 5
+_HELLO, _PAIR_REQUEST, _PAIR_REPLY, _SPLIT_REQUEST, _SPLIT_REPLY, _TEAM_REPORT = 1, 2, 3, 4, 5, 6
 _HEADER_BYTES = 3 + 25 + 5 * 9 + 1
 """Upper bound of what surrounds a body: array marks, schema, longest source, five integers, kind."""
 
@@ -77,7 +79,6 @@ _LIMITS: dict[str, Any] = {
     "max_map_len": 0,
     "max_ext_len": 0,
 }
-
 
 
 
@@ -139,6 +140,8 @@ def _pack_body(body: Body) -> tuple[int, tuple[Any, ...]]:
         return _SPLIT_REQUEST, (pack_epoch(body.epoch), measurements, _pack_split(body.snapshot))
     if isinstance(body, SplitReply):
         return _SPLIT_REPLY, (pack_epoch(body.epoch), _pack_split(body.snapshot))
+    if isinstance(body, TeamReport):
+        return _TEAM_REPORT, pack_report(body)
     raise TypeError(f"{type(body).__name__} is not a message body")
 
 
@@ -339,4 +342,5 @@ _BODIES: dict[int, Callable[[Any, Header], Body]] = {
     _PAIR_REPLY: _pair_reply,
     _SPLIT_REQUEST: _split_request,
     _SPLIT_REPLY: _split_reply,
+    _TEAM_REPORT: read_report,
 }

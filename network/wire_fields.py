@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf
 
-from network.messages import MAX_JOINT_DIM, NEVER, Array, Belief, Epoch, Measurement
+from network.messages import MAX_JOINT_DIM, NEVER, Array, Belief, Epoch, Measurement, Mount
 
 MODEL_DIMS = {
     "unicycle": 3,
@@ -191,6 +191,15 @@ def read_cov(raw: Any, n: int, floor: float, below: str) -> Array:
     return cov
 
 
+def read_noise(raw: Any, n: int) -> Array:
+    """(n, n) symmetric matrix that is not negative; noise may be missing altogether."""
+    cov: Array = read_array(raw, n * (n + 1) // 2)[FULL[n]]
+    slack = PART_FLOOR * float(cov.diagonal().max()) + BELIEF_FLOOR
+    if cov.diagonal().min() < 0.0 or dpotrf(cov + slack * np.eye(n), lower=1)[1] != 0:
+        raise WireError("not_positive_definite")
+    return cov
+
+
 def read_epoch(raw: Any) -> Epoch:
     t_meas_ns, initiator, counter = read_fields(raw, 3)
     if read_text(initiator) == "":
@@ -224,9 +233,13 @@ def read_measurement(raw: Any) -> Measurement:
         raise WireError("unknown_kind")
     if read_integer(m) != dim:
         raise WireError("malformed")
-    x, y, up, roll, pitch, yaw = read_array(mount, 6).tolist()
     cov = read_cov(R, dim, SENSOR_FLOOR, "below_sensor_floor")
-    return Measurement(kind, read_array(z, dim), cov, (x, y, up, roll, pitch, yaw))
+    return Measurement(kind, read_array(z, dim), cov, read_mount(mount))
+
+
+def read_mount(raw: Any) -> Mount:
+    x, y, up, roll, pitch, yaw = read_array(raw, 6).tolist()
+    return x, y, up, roll, pitch, yaw
 
 
 def is_part(part: Array, whole: Array) -> bool:

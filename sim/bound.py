@@ -13,7 +13,7 @@ from agent.events import LEVEL, Odometry
 from agent.sensor_input import SensorConfig
 from agent.settings import CoastSettings, nanoseconds
 from agent.timeline import OdometryTrack, Phase
-from sim.centralized import CentralizedFilter
+from agent.estimation.centralized import CentralizedFilter
 from sim.scenario import Scenario, sensor_config
 from sim.world import Output, World, order
 

@@ -34,7 +34,6 @@ PURE = (
     *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "agent" / "estimation").glob("*.py"))),
     "sim/world.py",
     "sim/noise.py",
-    "sim/centralized.py",
     "sim/metrics.py",
 )
 CONFIG_ONLY = ("agent/config.py", "agent/config_file.py", "agent/config_parts.py", "sim/scenario.py")

@@ -19,8 +19,11 @@ from network.messages import (
     MAX_JOINT_DIM,
     MAX_LINES,
     MAX_MESSAGE_BYTES,
+    MAX_RAW_MEASUREMENTS,
+    MAX_RECKONINGS,
     MAX_TARGETS,
     NEVER,
+    NO_MOUNT,
     Belief,
     Body,
     ClockEcho,
@@ -32,15 +35,19 @@ from network.messages import (
     Message,
     PairReply,
     PairRequest,
+    RawMeasurement,
+    Reckoning,
     ReplyStatus,
     Snapshot,
     SplitReply,
     SplitRequest,
     SplitSnapshot,
     TargetBelief,
+    TeamReport,
 )
 from network.wire import OversizeError, decode, encode, peek_header, size_bound
 from network.wire_fields import MAX_INT, MEASUREMENT_DIMS, MODEL_DIMS, REASONS, WireError
+from network.wire_team import ABSOLUTE_DIMS, MAX_INDEX
 
 VECTORS = Path(__file__).parents[1] / "vectors" / "v1.json"
 EYE = np.eye(3)
@@ -88,6 +95,25 @@ def example_split(private: bool = True) -> SplitSnapshot:
     return SplitSnapshot("unicycle", (("t1", "constant_velocity"),), np.arange(7.0) / 4, cov, own)
 
 
+def example_report() -> TeamReport:
+    """A drone re-anchored at 900: the end of the old reckoning, two of the new one, and what it measured."""
+    noise, mount = np.diag([0.25, 0.125, 0.0, 0.0625]), (0.1, 0.0, 0.0, 0.0, 1.5, 0.0)
+    return TeamReport(
+        born_ns=100,
+        reckonings=(
+            Reckoning(100, 900, np.array([3.0, -1.5, 0.25, 7.0]), noise),
+            Reckoning(900, 950, np.array([0.5, 0.0, 0.0, 0.125]), noise / 8),
+            Reckoning(900, 1_000, np.array([1.0, 0.125, 0.0, 0.25]), noise / 4),
+        ),
+        measurements=(
+            RawMeasurement(950, 0, "r2", "range", np.array([4.5]), np.array([[0.04]])),
+            RawMeasurement(1_000, 0, None, "pose", np.array([1.0, 2.0, 8.0, 0.5]), np.eye(4) / 16),
+            RawMeasurement(1_000, 1, "landmark:Gate.7", "pixel", np.array([0.25, -0.125]), np.eye(2) / 16384, mount),
+            RawMeasurement(1_000, 2, "target:t1", "bearing3", np.array([-3.0, 0.5]), np.eye(2) / 1024),
+        ),
+    )
+
+
 EXAMPLES: dict[str, Body] = {
     "hello": Hello("0.1.0", (ClockEcho("r2", 10, 20), ClockEcho("r3", 30, 40))),
     "pair_request": example_request(),
@@ -96,6 +122,7 @@ EXAMPLES: dict[str, Body] = {
     "pair_reply_too_old": PairReply(Epoch(1_000, "r2", 9), ReplyStatus.TOO_OLD),
     "split_request": SplitRequest(Epoch(1_000, "r1", 9), example_request().measurements, example_split()),
     "split_reply": SplitReply(Epoch(1_000, "r2", 9), example_split(private=False)),
+    "team_report": example_report(),
 }
 
 
@@ -183,9 +210,40 @@ def split_snapshots(draw: st.DrawFn) -> SplitSnapshot:
 
 
 @st.composite
+def reports(draw: st.DrawFn, source: str, until_ns: int) -> TeamReport:
+    born_ns = draw(st.integers(0, until_ns))
+    instants = sorted(draw(st.lists(st.integers(born_ns, until_ns), max_size=MAX_RECKONINGS, unique=True)))
+    reckonings = []
+    for t_ns in instants:
+        if t_ns > born_ns:
+            cov = draw(st.floats(0, 1)) * draw(covariances(4))
+            reckonings.append(Reckoning(draw(st.integers(born_ns, t_ns - 1)), t_ns, draw(arrays(4)), cov))
+    found = draw(st.lists(st.tuples(st.integers(0, until_ns), st.integers(0, MAX_INDEX)), max_size=4, unique=True))
+    if not found and not reckonings:
+        found = [(until_ns, 0)]
+    return TeamReport(born_ns, tuple(reckonings), tuple(draw(raw_measurements(source, *key)) for key in found))
+
+
+@st.composite
+def raw_measurements(draw: st.DrawFn, source: str, t_ns: int, index: int) -> RawMeasurement:
+    if draw(st.booleans()):
+        kind = draw(st.sampled_from(sorted(ABSOLUTE_DIMS)))
+        of, m, mount = None, draw(st.sampled_from(ABSOLUTE_DIMS[kind])), NO_MOUNT
+    else:
+        kind = draw(st.sampled_from(sorted(MEASUREMENT_DIMS)))
+        prefix = draw(st.sampled_from(["", "target:", "landmark:"]))
+        of, m = prefix + draw(ids.filter(lambda name: prefix or name != source)), MEASUREMENT_DIMS[kind]
+        mount = draw(st.tuples(numbers, numbers, numbers, numbers, numbers, numbers))
+    z = draw(arrays(m))
+    if kind in ("range", "range_bearing"):
+        z[0] = abs(z[0])
+    return RawMeasurement(t_ns, index, of, kind, z, draw(covariances(m)), mount)
+
+
+@st.composite
 def messages(draw: st.DrawFn) -> Message:
     header = Header(draw(ids), *(draw(stamps) for _ in range(5)))
-    kind = draw(st.sampled_from(["hello", "request", "reply", "split request", "split reply"]))
+    kind = draw(st.sampled_from(["hello", "request", "reply", "split request", "split reply", "report"]))
     body: Body
     if kind == "hello":
         peers = sorted(draw(st.lists(ids, max_size=MAX_ECHOES, unique=True)))
@@ -201,6 +259,8 @@ def messages(draw: st.DrawFn) -> Message:
         epoch = Epoch(draw(stamps), header.source, draw(stamps))
         measured = draw(st.lists(measurements(), min_size=1, max_size=2))
         body = SplitRequest(epoch, tuple(measured), draw(split_snapshots()))
+    elif kind == "report":
+        body = draw(reports(header.source, header.t_meas_ns))
     elif kind == "split reply":
         body = SplitReply(draw(epochs), draw(split_snapshots()))
     else:
@@ -254,6 +314,15 @@ def split_with(**changes: Any) -> SplitReply:
     return SplitReply(Epoch(1_000, "r2", 9), dataclasses.replace(example_split(), **changes))
 
 
+def report_with(**changes: Any) -> TeamReport:
+    return dataclasses.replace(example_report(), **changes)
+
+
+def measured_with(**changes: Any) -> TeamReport:
+    first, *others = example_report().measurements
+    return report_with(measurements=(dataclasses.replace(first, **changes), *others))
+
+
 def test_too_many_lines_and_targets_for_one_datagram_are_an_oversize_error() -> None:
     lines = tuple(Line(Epoch(500 + k, "r1", k), EYE) for k in range(MAX_LINES))
     belief = Belief("constant_velocity", np.zeros(4), np.eye(4))
@@ -288,6 +357,21 @@ def test_too_many_lines_and_targets_for_one_datagram_are_an_oversize_error() -> 
         split_with(cov=-np.eye(7), private=None),
         split_with(targets=(("t1", "hovercraft"),)),
         split_with(targets=(("t1", "unicycle"),)),
+        TeamReport(100, ()),
+        report_with(born_ns=1_001),
+        report_with(born_ns=101),
+        report_with(reckonings=example_report().reckonings[::-1]),
+        report_with(reckonings=(Reckoning(100, 900, np.zeros(3), np.eye(4)),)),
+        report_with(reckonings=(Reckoning(100, 900, np.zeros(4), -np.eye(4)),)),
+        measured_with(t_ns=1_001),
+        measured_with(t_ns=1_000),
+        measured_with(of="r1"),
+        measured_with(of="team:t1"),
+        measured_with(kind="pose"),
+        measured_with(of=None),
+        measured_with(z=np.array([-1.0])),
+        measured_with(R=-np.eye(1)),
+        measured_with(index=MAX_INDEX + 1),
         Hello("spaces and <markup>"),
         Hello("1", (ClockEcho("r2", 1, 1), ClockEcho("r2", 1, 1))),
         Hello("1", (ClockEcho("r2", -1, 1),)),
@@ -402,6 +486,33 @@ SPOILED = {
     "private of another size": (put("split_request", (2, 2, 4), doubles(1.0)), "malformed"),
     "a split contact that never met": (put("split_reply", (2, 0), [0, "", 0]), "out_of_range"),
     "a split request for another": (put("split_request", (2, 0, 1), "r2"), "source_mismatch"),
+    "a life that begins after its message": (put("team_report", (2, 0), 1_001), "out_of_range"),
+    "a report of nothing": (put("team_report", (2,), [100, [], []]), "malformed"),
+    "odometry from before its life": (put("team_report", (2, 1, 0, 0), 99), "out_of_range"),
+    "odometry that ends where it begins": (put("team_report", (2, 1, 0, 1), 100), "out_of_range"),
+    "odometry that ends after the message": (put("team_report", (2, 1, 2, 1), 1_001), "out_of_range"),
+    "odometry told twice": (put("team_report", (2, 1, 1, 1), 1_000), "malformed"),
+    "odometry of three numbers": (put("team_report", (2, 1, 0, 2), doubles(1, 2, 3)), "malformed"),
+    "odometry without a stamp": (put("team_report", (2, 1, 0, 1), None), "wrong_type"),
+    "odometry that is not a number": (put("team_report", (2, 1, 0, 2), doubles(1, 2, 3, float("nan"))), "non_finite"),
+    "negative noise of odometry": (
+        put("team_report", (2, 1, 0, 3), doubles(*np.diag([1.0, 1.0, -1e-6, 1.0])[np.triu_indices(4)])),
+        "not_positive_definite",
+    ),
+    "too much odometry": (put("team_report", (2, 1), [0] * (MAX_RECKONINGS + 1)), "out_of_range"),
+    "too many raw measurements": (put("team_report", (2, 2), [0] * MAX_RAW_MEASUREMENTS), "wrong_type"),
+    "more raw measurements than any array": (put("team_report", (2, 2), [0] * (MAX_RAW_MEASUREMENTS + 1)), "malformed"),
+    "a measurement of itself": (put("team_report", (2, 2, 0, 2), "r1"), "bad_id"),
+    "a measurement of nonsense": (put("team_report", (2, 2, 0, 2), "target:T"), "bad_id"),
+    "a range of nobody": (put("team_report", (2, 2, 0, 2), None), "unknown_kind"),
+    "a pose of another": (put("team_report", (2, 2, 1, 2), "r2"), "unknown_kind"),
+    "a pose of two numbers": (put("team_report", (2, 2, 1, 4), 2), "malformed"),
+    "a negative range": (put("team_report", (2, 2, 0, 5), doubles(-1.0)), "out_of_range"),
+    "two measurements under one name": (put("team_report", (2, 2, 2, 1), 0), "malformed"),
+    "a measurement of the future": (put("team_report", (2, 2, 0, 0), 1_001), "out_of_range"),
+    "an index beyond all reason": (put("team_report", (2, 2, 0, 1), MAX_INDEX + 1), "out_of_range"),
+    "a mount of five numbers": (put("team_report", (2, 2, 2, 7), doubles(1, 2, 3, 4, 5)), "malformed"),
+    "a raw measurement below the floor": (put("team_report", (2, 2, 0, 6), doubles(1e-11)), "below_sensor_floor"),
     "an unknown status": (put("pair_reply", (2, 1), 9), "out_of_range"),
     "a refusal with a snapshot": (put("pair_reply", (2, 1), 1), "malformed"),
     "a success without a snapshot": (put("pair_reply", (2, 2), None), "malformed"),
@@ -467,7 +578,7 @@ def test_structures_of_any_shape_raise_only_wire_errors() -> None:
     trees = st.recursive(leaves, lambda inner: st.lists(inner, max_size=8), max_leaves=30)
 
     @settings(max_examples=200, deadline=None)
-    @given(trees, st.integers(0, 4))
+    @given(trees, st.integers(0, 6))
     def check(body: Any, kind: int) -> None:
         with pytest.raises(WireError):
             decode(msgpack.packb([[1, "r1", 1, 1, 1, 1, 1], kind, [body, [], []]]), "r1")

@@ -10,7 +10,7 @@ from agent.estimation.gaussian import wrap
 from agent.estimation.motion import PLANAR_MOTION, UNICYCLE, TargetMotion
 from agent.estimation.observation import RelativeModel, planar_mount
 from agent.estimation.unscented import Transform
-from sim.centralized import CentralizedFilter
+from agent.estimation.centralized import CentralizedFilter
 
 Array = NDArray[np.float64]
 
