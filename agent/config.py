@@ -36,6 +36,7 @@ from agent.config_parts import (
     OdometryPart,
     SensorKind,
     SigmaPart,
+    TeamMemberPart,
     TrackingPart,
 )
 from agent.estimation.observation import mount_of
@@ -44,6 +45,10 @@ from agent.sensor_input import SensorConfig
 from agent.settings import AgentSettings, nanoseconds
 
 _LOOPBACK = re.compile(r"\w+/(127\.\d+\.\d+\.\d+|localhost|\[::1\]):\d+(\?.*)?\Z")
+
+
+MAX_TEAM = 15
+"""Others of a team that share a joint belief: time and memory grow with powers of their number."""
 
 
 class IdentityPart(Part):
@@ -166,6 +171,7 @@ class AgentConfig(Part):
     sensors: dict[str, AgentSensorPart] = {}
     targets: list[AgentTargetPart] = []
     landmarks: list[LandmarkPart] = []
+    team: Annotated[list[TeamMemberPart], Field(max_length=MAX_TEAM)] = []
     zenoh: ZenohPart
     mavlink: MavlinkPart | None = None
     injection: InjectionPart | None = None
@@ -188,6 +194,7 @@ class AgentConfig(Part):
             lateness=self.lateness.settings(),
             coast=self.coast.settings(),
             track=self.tracking.kind != "none",
+            team=tuple(member.settings() for member in self.team),
         )
 
     def sensor_configs(self) -> dict[str, SensorConfig]:
@@ -214,7 +221,20 @@ def load_agent_config(path: Path) -> AgentConfig:
         config.initial.start_sigma.covariance(config.motion.model)
     except ConfigError as error:
         raise ConfigError(f"{path}: initial.{error}") from None
+    for member in config.team:
+        try:
+            member.settings()
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from None
+    if config.localization.kind == "replica" and not config.team:
+        raise ConfigError(
+            f"{path}: key 'team' is missing: localization.kind = 'replica' needs the id, mean, start_sigma and motion "
+            "of every other robot in [[team]]"
+        )
+    if any(member.id == config.identity.robot for member in config.team):
+        raise ConfigError(f"{path}: team.{config.identity.robot} is this robot itself; list the others only")
     for name, ids in (
+        ("team", [member.id for member in config.team]),
         ("target", [target.id for target in config.targets]),
         ("landmark", [landmark.id for landmark in config.landmarks]),
         ("peer", [peer.id for peer in config.zenoh.peers]),

@@ -22,13 +22,20 @@ from agent.estimation.motion import (
 )
 from agent.estimation.observation import Intrinsics
 from agent.estimation.odometry import OdometryNoise
-from agent.settings import CoastSettings, LatenessSettings, LocalizationSettings, TargetSettings, nanoseconds
+from agent.settings import (
+    CoastSettings,
+    LatenessSettings,
+    LocalizationSettings,
+    TargetSettings,
+    TeamMember,
+    nanoseconds,
+)
 from network.endpoint import EndpointSettings
 from network.links import LinkSettings
 
 
 class LocalizationPart(Part):
-    kind: Literal["clat"] = "clat"
+    kind: Literal["clat", "replica"] = "clat"
     form: Literal["split_joint", "safe", "published"] = "split_joint"
     transform: Literal["unscented", "linearized", "jacobian"] = "unscented"
     correlation: Literal["factors", "ignored"] = "factors"
@@ -39,9 +46,13 @@ class LocalizationPart(Part):
     def settings(self) -> LocalizationSettings:
         """`safe` uses a contact of a pair every 3 s and trace weights; `published` every one and log det.
 
-        `split_joint` uses every contact, and caps innovations unless told otherwise. Raises `ConfigError` for a naive
-        baseline without factors.
+        `split_joint` uses every contact, and caps innovations unless told otherwise; `replica` has no forms, and caps
+        them only if told. Raises `ConfigError` for a naive baseline without factors.
         """
+        if self.kind == "replica":
+            return LocalizationSettings(
+                kind="replica", transform=self.transform, innovation_cap=self.innovation_cap or 0.0
+            )
         if self.correlation == "ignored" and self.form == "split_joint":
             raise ConfigError(
                 "correlation = 'ignored' is a baseline of the forms with factors; add form = 'published' or 'safe'"
@@ -332,6 +343,23 @@ def target_motion(
         sigma = (drive,) * len(layout.position)
     steer = (control.speed_mps, control.yaw_rate_radps)
     return TargetMotion(layout, steer, sigma, noise_step_s, damping_s, held=held)
+
+
+class TeamMemberPart(Part):
+    """Another robot of the team: its belief at its start, and how it moves."""
+
+    id: Id
+    mean: list[Finite]
+    start_sigma: SigmaPart
+    motion: MotionPart = MotionPart()
+
+    def settings(self) -> TeamMember:
+        """Raises `ConfigError` naming the key."""
+        try:
+            motion, mean = self.motion.settings(), self.motion.completed(self.mean)
+            return TeamMember(self.id, motion, mean, self.start_sigma.covariance(self.motion.model))
+        except ConfigError as error:
+            raise ConfigError(f"team.{self.id}: {error}") from None
 
 
 class LandmarkPart(Part):

@@ -36,8 +36,16 @@ class CooperativeFilter(Protocol):
         """Move the newest state to `t_ns` by an odometry increment (4,) with covariance (4, 4)."""
         ...
 
-    def absolute(self, t_ns: int, kind: str, model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> None:
-        """Use information about the own state alone; `kind` names it in the figures."""
+    def absolute(
+        self,
+        t_ns: int,
+        kind: str,
+        model: AbsoluteModel | RelativeModel,
+        z: Array,
+        R: Array,
+        landmark: str | None = None,
+    ) -> None:
+        """Use information about the own state alone, by the place of a landmark perhaps; `kind` names it in figures."""
         ...
 
     def sighting(self, t_ns: int, target: str, event: Observation) -> None:
@@ -70,12 +78,16 @@ class CooperativeFilter(Protocol):
         """A peer appeared, fell silent or began a new life."""
         ...
 
+    def settled(self, until_ns: int, effects: list[Effect]) -> None:
+        """All own data of instants up to `until_ns` are in: what is for everybody may be told."""
+        ...
+
     def expire(self, now_ns: int, effects: list[Effect]) -> None:
         """What has waited too long."""
         ...
 
     def deadline_ns(self) -> int:
-        """When `expire` has something to do next."""
+        """When `expire` or `settled` has something to do next."""
         ...
 
     def estimate(self) -> Estimate:

@@ -58,6 +58,9 @@ class Agent:
         except np.linalg.LinAlgError:
             self.counters["update.failed"] += 1
         self._drain(effects)
+        # Of the present instant more data may follow, unless it is time itself that is told.
+        settled_ns = self.now_ns - self.settings.lateness.settle_ns
+        self.filter.settled(settled_ns if isinstance(event, Tick) else settled_ns - 1, effects)
         self.filter.expire(self.now_ns, effects)
         if self.filter.revision is not self._published:
             self._published = self.filter.revision
@@ -205,12 +208,13 @@ class Agent:
 
     def _landmark(self, t_ns: int, event: Observation) -> None:
         assert event.of is not None
-        position = self.settings.landmarks.get(event.of.removeprefix("landmark:"))
+        landmark = event.of.removeprefix("landmark:")
+        position = self.settings.landmarks.get(landmark)
         if position is None:
             self.counters["observation.unknown_landmark"] += 1
             return
         model = relative_model(event, self.settings.layout, landmark=position)
-        self.filter.absolute(t_ns, f"landmark_{event.kind}", model, event.z, event.R)
+        self.filter.absolute(t_ns, f"landmark_{event.kind}", model, event.z, event.R, landmark)
 
     def _contact(self, t_ns: int, event: Observation, effects: list[Effect]) -> None:
         """Open a contact for a measurement of a peer, with all measurements of that peer at this instant.

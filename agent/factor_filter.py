@@ -77,7 +77,15 @@ class FactorFilter:
     def _late(self, t_ns: int) -> bool:
         return t_ns < self.state.t_ns - self._settings.lateness.tolerance_ns
 
-    def absolute(self, t_ns: int, kind: str, model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> None:
+    def absolute(
+        self,
+        t_ns: int,
+        kind: str,
+        model: AbsoluteModel | RelativeModel,
+        z: Array,
+        R: Array,
+        landmark: str | None = None,
+    ) -> None:
         late = self._late(t_ns)
         then: RobotState | None = self.state
         if late:
@@ -185,6 +193,9 @@ class FactorFilter:
 
     def link_changed(self, event: LinkChange) -> None:
         self.state = self._pairs.link_changed(event, self.state, self.history)
+
+    def settled(self, until_ns: int, effects: list[Effect]) -> None:
+        """Nothing is told to everybody."""
 
     def expire(self, now_ns: int, effects: list[Effect]) -> None:
         self._pairs.expire(now_ns, effects)

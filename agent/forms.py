@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from agent.cooperative_filter import CooperativeFilter
 from agent.factor_filter import FactorFilter
+from agent.replica_filter import ReplicaFilter
 from agent.settings import AgentSettings
 from agent.split_filter import SplitFilter
 
@@ -15,6 +16,8 @@ def build_filter(
     settings: AgentSettings, counters: Counter[str], count_nis: Callable[[str, float], None]
 ) -> CooperativeFilter:
     """The filter of `settings.localization`."""
+    if settings.localization.kind == "replica":
+        return ReplicaFilter(settings, counters, count_nis)
     if settings.localization.form == "split_joint":
         return SplitFilter(settings, counters, count_nis)
     return FactorFilter(settings, counters, count_nis)

@@ -24,7 +24,7 @@ def nanoseconds(seconds: float) -> int:
 
 @dataclass(frozen=True, slots=True)
 class LocalizationSettings:
-    """Cooperative localization by correlation factors (`clat`).
+    """Cooperative localization: `clat`, by contacts of pairs, or `replica`, by raw data told to the whole team.
 
     sighting_weight / fusion_weight   how intersections choose their weight
     pair_interval_ns                  least time between two contacts of a pair that are used
@@ -33,6 +33,7 @@ class LocalizationSettings:
     max_lines                         identity lines kept per peer
     """
 
+    kind: Literal["clat", "replica"] = "clat"
     form: Literal["split_joint", "safe", "published"] = "split_joint"
     transform: Transform = "unscented"
     correlation: Literal["factors", "ignored"] = "factors"
@@ -85,6 +86,16 @@ class TargetSettings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TeamMember:
+    """Another robot of a team whose members keep the joint belief of all: how it moves, and its belief at its start."""
+
+    id: str
+    motion: RobotMotion
+    mean: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class AgentSettings:
     """Everything the core is given at its start."""
 
@@ -100,6 +111,7 @@ class AgentSettings:
     lateness: LatenessSettings = field(default_factory=LatenessSettings)
     coast: CoastSettings = field(default_factory=CoastSettings)
     track: bool = True
+    team: tuple[TeamMember, ...] = ()
 
     @property
     def layout(self) -> StateLayout:

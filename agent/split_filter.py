@@ -106,7 +106,15 @@ class SplitFilter:
             return self.state
         return None if self._settings.lateness.kind == "discard" else self.history.at(t_ns)
 
-    def absolute(self, t_ns: int, kind: str, model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> None:
+    def absolute(
+        self,
+        t_ns: int,
+        kind: str,
+        model: AbsoluteModel | RelativeModel,
+        z: Array,
+        R: Array,
+        landmark: str | None = None,
+    ) -> None:
         then = self._at(t_ns)
         if then is None:
             self._counters["late.dropped"] += 1
@@ -277,6 +285,9 @@ class SplitFilter:
         if before is not None and before != life:
             self._exchange(event.peer).restarted()
             self._counters["pair.restarts"] += 1
+
+    def settled(self, until_ns: int, effects: list[Effect]) -> None:
+        """Nothing is told to everybody."""
 
     def expire(self, now_ns: int, effects: list[Effect]) -> None:
         for peer, exchange in self._exchanges.items():

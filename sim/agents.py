@@ -64,9 +64,24 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
         },
         "targets": targets,
         "landmarks": [{"id": name, "position": [float(x) for x in place]} for name, place in world.landmarks.items()],
+        **({"team": team_tables(scenario, world, robot)} if scenario.localization_of(robot).kind == "replica" else {}),
         "zenoh": {"listen": [], "peers": []},
         "state_dir": "state",
     }
+
+
+def team_tables(scenario: Scenario, world: World, robot: RobotPart) -> list[dict[str, Any]]:
+    """What a robot is told of all others."""
+    return [
+        {
+            "id": other.id,
+            "mean": [float(value) for value in world.start_belief(other.id)[0]],
+            "start_sigma": table(other.start_sigma),
+            "motion": table(other.motion()),
+        }
+        for other in scenario.robots
+        if other.id != robot.id
+    ]
 
 
 def autopilot_fix(robot: RobotPart) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections import Counter
 from dataclasses import replace
@@ -9,11 +10,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.centralized import CentralizedFilter
+from agent.estimation.observation import OutOfViewError
 from agent.events import LEVEL, Odometry
 from agent.sensor_input import SensorConfig
 from agent.settings import CoastSettings, nanoseconds
 from agent.timeline import OdometryTrack, Phase
-from agent.estimation.centralized import CentralizedFilter
 from sim.scenario import Scenario, sensor_config
 from sim.world import Output, World, order
 
@@ -114,7 +116,8 @@ class _Joint:
         elif not item.of.startswith("landmark:"):
             self._advance(item.of, item.t_ns)
         mount, attitude = sensors[item.robot, item.sensor].mount, item.attitude or LEVEL
-        self.filter.observe(item.robot, item.kind, item.of, item.z, item.R, mount, attitude)
+        with contextlib.suppress(OutOfViewError):
+            self.filter.observe(item.robot, item.kind, item.of, item.z, item.R, mount, attitude)
 
     def _thinned(self, item: Output, peer: str) -> bool:
         """Whether the pair met a moment ago; all measurements of one instant count as one meeting."""

@@ -171,6 +171,7 @@ class VirtualEngine:
         self._now = 0
         self._nodes: dict[str, Node] = {}
         self._timers: dict[str, int] = {}
+        self._ticked: dict[str, int] = {}
         for robot in scenario.robots:
             config = agent_config(scenario, world, robot)
             boot = hashlib.blake2b(f"{seed}/{robot.id}".encode(), digest_size=7).digest()
@@ -242,6 +243,7 @@ class VirtualEngine:
                 self._carry_out(robot, node.on_packet(t_ns, what))
             elif self._timers.get(robot) == t_ns:
                 del self._timers[robot]
+                self._ticked[robot] = t_ns
                 self._carry_out(robot, node.on_tick(t_ns))
             self._note_contacts(robot, node)
         if self._now < end:
@@ -292,7 +294,9 @@ class VirtualEngine:
         heapq.heappush(self._heap, (t_ns, phase, rank, self._pushed, robot, what))
 
     def _arm(self, robot: str) -> None:
-        deadline = max(self._nodes[robot].next_deadline_ns(), self._now + 1)
+        # A timer may end the present instant, but each instant ends once.
+        earliest = self._now + 1 if self._ticked.get(robot) == self._now else self._now
+        deadline = max(self._nodes[robot].next_deadline_ns(), earliest)
         if self._timers.get(robot) == deadline:
             return
         self._timers[robot] = deadline

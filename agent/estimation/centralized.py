@@ -6,7 +6,6 @@ statistically over the states they involve only, K = P[:, sub] H^T S^-1 with S =
 
 from __future__ import annotations
 
-import contextlib
 import copy
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from agent.estimation.gaussian import gain, quadratic_form, symmetrize, wrap_components
 from agent.estimation.motion import RobotMotion, TargetMotion
-from agent.estimation.observation import AbsoluteModel, OutOfViewError, RelativeModel, absolute_model
+from agent.estimation.observation import AbsoluteModel, RelativeModel, absolute_model
 from agent.estimation.unscented import Propagated, Transform, observe
 from agent.events import LEVEL
 from network.messages import NO_MOUNT, Mount
@@ -77,11 +76,10 @@ class CentralizedFilter:
         for name, motion in self._motions.items():
             self._predict(name, motion.drift(*self.belief(name), dt_s, self._transform))
 
-    def fix(self, robot: str, kind: str, z: Array, R: Array) -> None:
-        """Absolute information z (m,), R (m, m); nothing happens if the robot's state has none of it."""
+    def fix(self, robot: str, kind: str, z: Array, R: Array) -> float | None:
+        """Absolute information z (m,), R (m, m): its NIS per degree of freedom; None if the state has none of it."""
         fix = absolute_model(kind, self._layouts[robot], z, R)
-        if fix is not None:
-            self._update(self._rows(robot), *fix)
+        return None if fix is None else self._update(self._rows(robot), *fix)
 
     def observe(
         self,
@@ -92,8 +90,11 @@ class CentralizedFilter:
         R: Array,
         mount: Mount = NO_MOUNT,
         attitude: tuple[float, float] = LEVEL,
-    ) -> None:
-        """A relative measurement of `r2`, `landmark:L3` or `target:t1`; a pixel of what is out of view is not used."""
+    ) -> float:
+        """A relative measurement of `r2`, `landmark:L3` or `target:t1`: its NIS per degree of freedom.
+
+        Raises `OutOfViewError` for a pixel of what is out of view; nothing has happened then.
+        """
         rows, layout = self._rows(robot), self._layouts[robot]
         if of.startswith("landmark:"):
             model = RelativeModel(kind, layout, mount, self._landmarks[of.removeprefix("landmark:")], attitude=attitude)
@@ -101,8 +102,7 @@ class CentralizedFilter:
             name = of.removeprefix("target:")
             rows = np.concatenate([rows, self._rows(name)])
             model = RelativeModel(kind, layout, mount, subject=self._layouts[name], attitude=attitude)
-        with contextlib.suppress(OutOfViewError):
-            self._update(rows, model, z, R)
+        return self._update(rows, model, z, R)
 
     def _rows(self, name: str) -> NDArray[np.intp]:
         part = self._parts[name]
@@ -115,7 +115,7 @@ class CentralizedFilter:
         self.cov[:, part] = self.cov[part, :].T
         self.cov[part, part] = moved.cov
 
-    def _update(self, rows: NDArray[np.intp], model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> None:
+    def _update(self, rows: NDArray[np.intp], model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> float:
         predicted = observe(
             model.h,
             model.jacobian,
@@ -132,3 +132,4 @@ class CentralizedFilter:
         K = gain(self.cov[:, rows] @ predicted.H.T, S)
         self.mean = wrap_components(self.mean + K @ innovation, self._angles)
         self.cov = symmetrize(self.cov - K @ S @ K.T)
+        return nis

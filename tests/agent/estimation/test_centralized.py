@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from agent.estimation.centralized import CentralizedFilter
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import PLANAR_MOTION, UNICYCLE, TargetMotion
 from agent.estimation.observation import RelativeModel, planar_mount
 from agent.estimation.unscented import Transform
-from agent.estimation.centralized import CentralizedFilter
 
 Array = NDArray[np.float64]
 

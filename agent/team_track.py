@@ -1,0 +1,188 @@
+"""Where one robot of a team is known to have moved: a chain of instants with its odometry since common anchors.
+
+What is heard late, twice or in another order leads to the same chain. Between two instants that share an anchor the
+motion is known, however much was lost in between; where the chain is broken (the robot has begun a new life) it coasts.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.estimation.reckoning import increment, moved_between
+from agent.settings import CoastSettings
+from network.messages import Reckoning
+
+Array = NDArray[np.float64]
+
+Life = tuple[int, int]
+"""Incarnation and boot id."""
+
+Anchor = tuple[Life, int]
+"""A life and an instant of it by the robot's own clock: where sums of odometry begin."""
+
+MAX_NODES = 4096
+NO_MOTION = np.zeros(4), np.zeros((4, 4))
+ROUNDING = 1e-9
+"""How negative a covariance may come out of sums, relative to them."""
+
+
+@dataclass(slots=True, eq=False)
+class Node:
+    """An instant of the chain, with the sums of odometry (4,), (4, 4) that lead to it, by anchor."""
+
+    t_ns: int
+    sums: dict[Anchor, tuple[Array, Array]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """How far a robot's state has been moved: to `t_ns`, by `delta` (4,) since `node`; None: it is at the node."""
+
+    t_ns: int
+    node: Node
+    delta: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """A stretch to `place` over `dt_s`, with the increment (4,), (4, 4) of odometry."""
+
+    place: Place
+    delta: Array
+    cov: Array
+    dt_s: float
+
+
+class Track:
+    """The chain of one robot, whose state starts at `start`. Instants are of the clock of whoever keeps it."""
+
+    def __init__(self, start: Node, coast: CoastSettings, tolerance_ns: int, counters: Counter[str]) -> None:
+        self._coast, self._tolerance_ns, self._counters = coast, tolerance_ns, counters
+        self._nodes = [start]
+        self._stamps = [start.t_ns]
+        self._known: dict[Anchor, Node] = {}
+        self.settled_ns = start.t_ns
+        """Nothing is learnt any more of what was up to here."""
+
+    @property
+    def newest(self) -> Node:
+        return self._nodes[-1]
+
+    def add(self, life: Life, reckoning: Reckoning, offset_ns: int) -> int | None:
+        """Take in odometry told by a robot whose clock is ahead by `offset_ns`.
+
+        Returns the earliest instant at which the robot's motion is another one now, None if nothing is new.
+        """
+        anchor = (life, reckoning.anchor_ns)
+        return _earliest(
+            self._put(anchor, reckoning.anchor_ns - offset_ns, anchor, NO_MOTION),
+            self._put((life, reckoning.t_ns), reckoning.t_ns - offset_ns, anchor, (reckoning.delta, reckoning.cov)),
+        )
+
+    def begin(self, life: Life, born_ns: int, offset_ns: int) -> int | None:
+        """A life begins at `born_ns` of the robot's clock; returns as `add`."""
+        return self._put((life, born_ns), born_ns - offset_ns, (life, born_ns), NO_MOTION)
+
+    def _put(self, name: Anchor, t_ns: int, anchor: Anchor, total: tuple[Array, Array]) -> int | None:
+        node = self._known.get(name)
+        if node is None:
+            index = bisect_left(self._stamps, t_ns)
+            same = index < len(self._stamps) and self._stamps[index] == t_ns
+            if not same and t_ns <= self.settled_ns:
+                return None
+            if not same and len(self._nodes) >= MAX_NODES:
+                self._counters["replica.overflow"] += 1
+                return None
+            node = self._nodes[index] if same else Node(t_ns)
+            if not same:
+                self._nodes.insert(index, node)
+                self._stamps.insert(index, t_ns)
+            self._known[name] = node
+        if anchor in node.sums:
+            return None
+        node.sums[anchor] = total
+        before = bisect_left(self._stamps, node.t_ns) - 1
+        if before < 0:
+            return node.t_ns
+        # Whatever counts as the instant of the node before does not depend on this one.
+        return min(node.t_ns - self._tolerance_ns, self._stamps[before] + self._tolerance_ns + 1)
+
+    def settle(self, place: Place) -> None:
+        """The state has been moved to `place` for good: forget what was before."""
+        index = bisect_left(self._stamps, place.node.t_ns)
+        del self._nodes[:index], self._stamps[:index]
+        self.settled_ns = max(self.settled_ns, place.t_ns)
+        self._known = {name: node for name, node in self._known.items() if node.t_ns >= place.node.t_ns}
+
+    # -- motion ---------------------------------------------------------------------------------------------
+
+    def next_ns(self, place: Place) -> int | None:
+        """The first instant of the chain after `place`."""
+        index = bisect_right(self._stamps, place.t_ns)
+        return self._stamps[index] if index < len(self._stamps) else None
+
+    def covers(self, place: Place, t_ns: int) -> bool:
+        """Whether a state at `place` can be brought to `t_ns`, give or take the tolerance, without guessing."""
+        at, tolerance = place, self._tolerance_ns
+        while at.t_ns < t_ns - tolerance:
+            index = bisect_right(self._stamps, at.t_ns)
+            if index == len(self._stamps):
+                return False
+            node = self._nodes[index]
+            if node.t_ns > t_ns + tolerance:
+                return _shared(at.node, node) is not None
+            at = Place(node.t_ns, node)
+        return True
+
+    def step(self, place: Place, until_ns: int) -> Step:
+        """The next stretch from `place` towards `until_ns`, which is later: to the next instant of the chain at most.
+
+        Where the chain is broken the stretch leads to that instant, by coasting. Raises `ValueError` at the end of the
+        chain.
+        """
+        index = bisect_right(self._stamps, place.t_ns)
+        if index == len(self._stamps):
+            raise ValueError("the chain ends here; ask `covers` first")
+        node = self._nodes[index]
+        moved = self._moved(place.node, node)
+        if moved is None:
+            dt_s = (node.t_ns - place.t_ns) * 1e-9
+            spread, turn = (self._coast.speed_mps * dt_s) ** 2, (self._coast.yaw_rate_radps * dt_s) ** 2
+            return Step(Place(node.t_ns, node), np.zeros(4), np.diag([spread, spread, spread, turn]), dt_s)
+        delta, cov = moved
+        whole = node.t_ns - place.node.t_ns
+        if node.t_ns <= until_ns + self._tolerance_ns:
+            end = Place(node.t_ns, node)
+        else:
+            end = Place(until_ns, place.node, delta * ((until_ns - place.node.t_ns) / whole))
+        gone = end.t_ns - place.t_ns
+        target = delta if end.delta is None else end.delta
+        rest = target if place.delta is None else moved_between(place.delta, target)
+        return Step(end, rest, cov * (gone / whole) if gone < whole else cov, gone * 1e-9)
+
+    def _moved(self, first: Node, second: Node) -> tuple[Array, Array] | None:
+        """The increment between two nodes; None if no anchor tells it."""
+        anchor = _shared(first, second)
+        if anchor is None:
+            return None
+        delta, cov = increment(*first.sums[anchor], *second.sums[anchor])
+        scale = float(np.abs(second.sums[anchor][1]).max())
+        if np.linalg.eigvalsh(cov)[0] < -ROUNDING * scale - 1e-15:
+            # Not of one odometry: whoever told it is wrong somewhere.
+            self._counters["replica.bad_odometry"] += 1
+            return None
+        return delta, cov
+
+
+def _shared(first: Node, second: Node) -> Anchor | None:
+    """The latest anchor both nodes have a sum of."""
+    return max(first.sums.keys() & second.sums.keys(), default=None)
+
+
+def _earliest(*instants: int | None) -> int | None:
+    return min((t_ns for t_ns in instants if t_ns is not None), default=None)
