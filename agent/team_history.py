@@ -146,7 +146,7 @@ class TeamHistory:
         """
         track = self.tracks.get(robot)
         if track is None:
-            start = Node(born_ns - offset_ns)
+            start = Node(born_ns - offset_ns, born_ns - offset_ns)
             coast, tolerance_ns = self._settings.coast, self._settings.lateness.tolerance_ns
             track = self.tracks[robot] = Track(start, coast, tolerance_ns, self._counters)
             self._base.places[robot] = Place(start.t_ns, start)

@@ -24,7 +24,7 @@ class Teller:
     """Own odometry and measurements on their way to the team."""
 
     def __init__(self, born_ns: int) -> None:
-        self._born_ns = self._anchor_ns = born_ns
+        self._born_ns = self._anchor_ns = self._t_ns = born_ns
         self._total = np.zeros(4), np.zeros((4, 4))
         self._closing: Reckoning | None = None
         self._last: Reckoning | None = None
@@ -36,7 +36,8 @@ class Teller:
     def moved(self, t_ns: int, delta: Array, cov: Array) -> Reckoning:
         """An increment of odometry (4,), (4, 4) up to `t_ns`."""
         self._total = extended(*self._total, delta, cov)
-        found = Reckoning(self._anchor_ns, t_ns, *self._total)
+        found = Reckoning(self._anchor_ns, self._t_ns, t_ns, *self._total)
+        self._t_ns = t_ns
         self._moves.append(found)
         if t_ns - self._anchor_ns >= ANCHOR_NS:
             self._anchor_ns, self._closing, self._total = t_ns, found, (np.zeros(4), np.zeros((4, 4)))

@@ -33,9 +33,13 @@ ROUNDING = 1e-9
 
 @dataclass(slots=True, eq=False)
 class Node:
-    """An instant of the chain, with the sums of odometry (4,), (4, 4) that lead to it, by anchor."""
+    """An instant of the chain, with the sums of odometry (4,), (4, 4) that lead to it, by anchor.
+
+    The robot itself has it that it moved evenly since `even_ns`; before that nobody knows what is not told.
+    """
 
     t_ns: int
+    even_ns: int
     sums: dict[Anchor, tuple[Array, Array]] = field(default_factory=dict)
 
 
@@ -79,33 +83,39 @@ class Track:
         Returns the earliest instant at which the robot's motion is another one now, None if nothing is new.
         """
         anchor = (life, reckoning.anchor_ns)
+        anchor_ns, even_ns = reckoning.anchor_ns - offset_ns, reckoning.before_ns - offset_ns
+        node, total = Node(reckoning.t_ns - offset_ns, even_ns), (reckoning.delta, reckoning.cov)
         return _earliest(
-            self._put(anchor, reckoning.anchor_ns - offset_ns, anchor, NO_MOTION),
-            self._put((life, reckoning.t_ns), reckoning.t_ns - offset_ns, anchor, (reckoning.delta, reckoning.cov)),
+            self._put(anchor, Node(anchor_ns, anchor_ns), anchor, NO_MOTION),
+            self._put((life, reckoning.t_ns), node, anchor, total),
         )
 
     def begin(self, life: Life, born_ns: int, offset_ns: int) -> int | None:
         """A life begins at `born_ns` of the robot's clock; returns as `add`."""
-        return self._put((life, born_ns), born_ns - offset_ns, (life, born_ns), NO_MOTION)
+        t_ns = born_ns - offset_ns
+        return self._put((life, born_ns), Node(t_ns, t_ns), (life, born_ns), NO_MOTION)
 
-    def _put(self, name: Anchor, t_ns: int, anchor: Anchor, total: tuple[Array, Array]) -> int | None:
+    def _put(self, name: Anchor, new: Node, anchor: Anchor, total: tuple[Array, Array]) -> int | None:
+        """Take in a sum that leads to a node which is new, unless it is known by its name or instant."""
         node = self._known.get(name)
         if node is None:
-            index = bisect_left(self._stamps, t_ns)
-            same = index < len(self._stamps) and self._stamps[index] == t_ns
-            if not same and t_ns <= self.settled_ns:
+            index = bisect_left(self._stamps, new.t_ns)
+            if index < len(self._stamps) and self._stamps[index] == new.t_ns:
+                node = self._nodes[index]
+            elif new.t_ns <= self.settled_ns:
                 return None
-            if not same and len(self._nodes) >= MAX_NODES:
+            elif len(self._nodes) >= MAX_NODES:
                 self._counters["replica.overflow"] += 1
                 return None
-            node = self._nodes[index] if same else Node(t_ns)
-            if not same:
+            else:
+                node = new
                 self._nodes.insert(index, node)
-                self._stamps.insert(index, t_ns)
+                self._stamps.insert(index, node.t_ns)
             self._known[name] = node
         if anchor in node.sums:
             return None
         node.sums[anchor] = total
+        node.even_ns = min(node.even_ns, new.even_ns)
         before = bisect_left(self._stamps, node.t_ns) - 1
         if before < 0:
             return node.t_ns
@@ -152,8 +162,7 @@ class Track:
         moved = self._moved(place.node, node)
         if moved is None:
             dt_s = (node.t_ns - place.t_ns) * 1e-9
-            spread, turn = (self._coast.speed_mps * dt_s) ** 2, (self._coast.yaw_rate_radps * dt_s) ** 2
-            return Step(Place(node.t_ns, node), np.zeros(4), np.diag([spread, spread, spread, turn]), dt_s)
+            return Step(Place(node.t_ns, node), np.zeros(4), self._coasted(dt_s), dt_s)
         delta, cov = moved
         whole = node.t_ns - place.node.t_ns
         if node.t_ns <= until_ns + self._tolerance_ns:
@@ -163,7 +172,26 @@ class Track:
         gone = end.t_ns - place.t_ns
         target = delta if end.delta is None else end.delta
         rest = target if place.delta is None else moved_between(place.delta, target)
-        return Step(end, rest, cov * (gone / whole) if gone < whole else cov, gone * 1e-9)
+        noise = cov * (gone / whole) if gone < whole else cov
+        if node.even_ns > place.node.t_ns:
+            noise = noise + self._strayed(place, node) + self._strayed(end, node)
+        return Step(end, rest, noise, gone * 1e-9)
+
+    def _strayed(self, place: Place, node: Node) -> Array:
+        """How far the robot may be (4, 4) from the even way to `node` if what it told in between has not been heard.
+
+        Its velocity may have been another one before `place` than after, as when it coasts. Charged before and after,
+        it covers an error that is made up for at the node.
+        """
+        if place.delta is None:
+            return np.zeros((4, 4))
+        whole, gone = (node.t_ns - place.node.t_ns) * 1e-9, (place.t_ns - place.node.t_ns) * 1e-9
+        time_s = gone * (1.0 - gone / whole)
+        return self._coasted(time_s)
+
+    def _coasted(self, time_s: float) -> Array:
+        spread, turn = (self._coast.speed_mps * time_s) ** 2, (self._coast.yaw_rate_radps * time_s) ** 2
+        return np.diag([spread, spread, spread, turn])
 
     def _moved(self, first: Node, second: Node) -> tuple[Array, Array] | None:
         """The increment between two nodes; None if no anchor tells it."""

@@ -221,13 +221,14 @@ class SplitReply:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reckoning:
-    """A robot's odometry from `anchor_ns` to `t_ns` as one increment.
+    """A robot's odometry from `anchor_ns` to `t_ns` as one increment; its last part began at `before_ns`.
 
     delta (4,) is dx, dy, dz, dyaw (not wrapped) in the body frame at the anchor, cov (4, 4) its covariance, positive
     semi-definite. Two of one anchor tell the odometry between them, whatever was lost in between.
     """
 
     anchor_ns: int
+    before_ns: int
     t_ns: int
     delta: Array
     cov: Array

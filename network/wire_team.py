@@ -1,6 +1,7 @@
 """Wire format of what a robot tells its whole team: `[born_ns, [reckoning, ...], [measurement, ...]]`.
 
-A reckoning is `[anchor_ns, t_ns, delta, cov]`, a measurement `[t_ns, index, of, kind, m, z, R, mount or nil]`.
+A reckoning is `[anchor_ns, before_ns, t_ns, delta, cov]`; a measurement is
+`[t_ns, index, of, kind, m, z, R, mount or nil]`.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ _SUBJECT = re.compile(r"(?:landmark:[A-Za-z0-9_.-]{1,32}|target:[a-z0-9-]{1,24}|
 
 def pack_report(report: TeamReport) -> tuple[Any, ...]:
     reckonings = tuple(
-        (item.anchor_ns, item.t_ns, pack_array(item.delta, (4,)), pack_cov(item.cov, 4)) for item in report.reckonings
+        (item.anchor_ns, item.before_ns, item.t_ns, pack_array(item.delta, (4,)), pack_cov(item.cov, 4))
+        for item in report.reckonings
     )
     return report.born_ns, reckonings, tuple(map(_pack_measurement, report.measurements))
 
@@ -72,11 +74,12 @@ def read_report(raw: Any, header: Header) -> TeamReport:
 
 
 def _reckoning(raw: Any, born_ns: int, header: Header) -> Reckoning:
-    anchor_raw, t_raw, delta, cov = read_fields(raw, 4)
-    anchor_ns, t_ns = read_integer(anchor_raw), read_integer(t_raw, header.t_meas_ns)
-    if not born_ns <= anchor_ns < t_ns:
+    anchor_raw, before_raw, t_raw, delta, cov = read_fields(raw, 5)
+    anchor_ns, before_ns = read_integer(anchor_raw), read_integer(before_raw)
+    t_ns = read_integer(t_raw, header.t_meas_ns)
+    if not born_ns <= anchor_ns <= before_ns < t_ns:
         raise WireError("out_of_range")
-    return Reckoning(anchor_ns, t_ns, read_array(delta, 4), read_noise(cov, 4))
+    return Reckoning(anchor_ns, before_ns, t_ns, read_array(delta, 4), read_noise(cov, 4))
 
 
 def _measurement(raw: Any, header: Header) -> RawMeasurement:

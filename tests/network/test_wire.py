@@ -101,9 +101,9 @@ def example_report() -> TeamReport:
     return TeamReport(
         born_ns=100,
         reckonings=(
-            Reckoning(100, 900, np.array([3.0, -1.5, 0.25, 7.0]), noise),
-            Reckoning(900, 950, np.array([0.5, 0.0, 0.0, 0.125]), noise / 8),
-            Reckoning(900, 1_000, np.array([1.0, 0.125, 0.0, 0.25]), noise / 4),
+            Reckoning(100, 850, 900, np.array([3.0, -1.5, 0.25, 7.0]), noise),
+            Reckoning(900, 900, 950, np.array([0.5, 0.0, 0.0, 0.125]), noise / 8),
+            Reckoning(900, 950, 1_000, np.array([1.0, 0.125, 0.0, 0.25]), noise / 4),
         ),
         measurements=(
             RawMeasurement(950, 0, "r2", "range", np.array([4.5]), np.array([[0.04]])),
@@ -217,7 +217,8 @@ def reports(draw: st.DrawFn, source: str, until_ns: int) -> TeamReport:
     for t_ns in instants:
         if t_ns > born_ns:
             cov = draw(st.floats(0, 1)) * draw(covariances(4))
-            reckonings.append(Reckoning(draw(st.integers(born_ns, t_ns - 1)), t_ns, draw(arrays(4)), cov))
+            anchor_ns = draw(st.integers(born_ns, t_ns - 1))
+            reckonings.append(Reckoning(anchor_ns, draw(st.integers(anchor_ns, t_ns - 1)), t_ns, draw(arrays(4)), cov))
     found = draw(st.lists(st.tuples(st.integers(0, until_ns), st.integers(0, MAX_INDEX)), max_size=4, unique=True))
     if not found and not reckonings:
         found = [(until_ns, 0)]
@@ -361,8 +362,8 @@ def test_too_many_lines_and_targets_for_one_datagram_are_an_oversize_error() -> 
         report_with(born_ns=1_001),
         report_with(born_ns=101),
         report_with(reckonings=example_report().reckonings[::-1]),
-        report_with(reckonings=(Reckoning(100, 900, np.zeros(3), np.eye(4)),)),
-        report_with(reckonings=(Reckoning(100, 900, np.zeros(4), -np.eye(4)),)),
+        report_with(reckonings=(Reckoning(100, 100, 900, np.zeros(3), np.eye(4)),)),
+        report_with(reckonings=(Reckoning(100, 100, 900, np.zeros(4), -np.eye(4)),)),
         measured_with(t_ns=1_001),
         measured_with(t_ns=1_000),
         measured_with(of="r1"),
@@ -489,14 +490,15 @@ SPOILED = {
     "a life that begins after its message": (put("team_report", (2, 0), 1_001), "out_of_range"),
     "a report of nothing": (put("team_report", (2,), [100, [], []]), "malformed"),
     "odometry from before its life": (put("team_report", (2, 1, 0, 0), 99), "out_of_range"),
-    "odometry that ends where it begins": (put("team_report", (2, 1, 0, 1), 100), "out_of_range"),
-    "odometry that ends after the message": (put("team_report", (2, 1, 2, 1), 1_001), "out_of_range"),
-    "odometry told twice": (put("team_report", (2, 1, 1, 1), 1_000), "malformed"),
-    "odometry of three numbers": (put("team_report", (2, 1, 0, 2), doubles(1, 2, 3)), "malformed"),
-    "odometry without a stamp": (put("team_report", (2, 1, 0, 1), None), "wrong_type"),
-    "odometry that is not a number": (put("team_report", (2, 1, 0, 2), doubles(1, 2, 3, float("nan"))), "non_finite"),
+    "odometry that ends where it begins": (put("team_report", (2, 1, 0, 2), 850), "out_of_range"),
+    "odometry whose last part began before the anchor": (put("team_report", (2, 1, 0, 1), 99), "out_of_range"),
+    "odometry that ends after the message": (put("team_report", (2, 1, 2, 2), 1_001), "out_of_range"),
+    "odometry told twice": (put("team_report", (2, 1, 1, 2), 1_000), "malformed"),
+    "odometry of three numbers": (put("team_report", (2, 1, 0, 3), doubles(1, 2, 3)), "malformed"),
+    "odometry without a stamp": (put("team_report", (2, 1, 0, 2), None), "wrong_type"),
+    "odometry that is not a number": (put("team_report", (2, 1, 0, 3), doubles(1, 2, 3, float("nan"))), "non_finite"),
     "negative noise of odometry": (
-        put("team_report", (2, 1, 0, 3), doubles(*np.diag([1.0, 1.0, -1e-6, 1.0])[np.triu_indices(4)])),
+        put("team_report", (2, 1, 0, 4), doubles(*np.diag([1.0, 1.0, -1e-6, 1.0])[np.triu_indices(4)])),
         "not_positive_definite",
     ),
     "too much odometry": (put("team_report", (2, 1), [0] * (MAX_RECKONINGS + 1)), "out_of_range"),
