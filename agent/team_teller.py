@@ -1,10 +1,13 @@
 """What a robot tells its team: odometry since an anchor, and each measurement twice.
 
-A report holds the newest instant and the one before; odometry is summed since an anchor that is renewed from time to
-time, and the end of the sum before is in every report. Of what is lost, only measurements that are lost twice are gone.
+A report holds measurements of the newest instant and the one before, and odometry of some more. Odometry is summed
+since an anchor that is renewed from time to time, and the end of the sum before is in every report: whatever is lost,
+the next report tells how far the robot has moved.
 """
 
 from __future__ import annotations
+
+from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +23,18 @@ ANCHOR_NS = 600 * NS
 """How long odometry is summed. A peer that hears nothing for longer than this does not know what happened meanwhile."""
 
 
+REPEATS = 2
+"""How often odometry of an instant is told again: what a peer measured at an instant nobody has told of is no use."""
+
+
 class Teller:
     """Own odometry and measurements on their way to the team."""
 
     def __init__(self, born_ns: int) -> None:
         self._born_ns = self._anchor_ns = self._t_ns = born_ns
         self._total = np.zeros(4), np.zeros((4, 4))
-        self._closing: Reckoning | None = None
-        self._last: Reckoning | None = None
+        self._ends: deque[Reckoning] = deque(maxlen=2)
+        self._last: deque[Reckoning] = deque(maxlen=REPEATS)
         self._moves: list[Reckoning] = []
         self._fresh: list[RawMeasurement] = []
         self._repeats: list[RawMeasurement] = []
@@ -40,7 +47,8 @@ class Teller:
         self._t_ns = t_ns
         self._moves.append(found)
         if t_ns - self._anchor_ns >= ANCHOR_NS:
-            self._anchor_ns, self._closing, self._total = t_ns, found, (np.zeros(4), np.zeros((4, 4)))
+            self._ends.append(found)
+            self._anchor_ns, self._total = t_ns, (np.zeros(4), np.zeros((4, 4)))
         return found
 
     def index(self, t_ns: int, oldest_ns: int) -> int:
@@ -78,7 +86,9 @@ class Teller:
 
     def _split(self, move: Reckoning | None, fresh: list[RawMeasurement]) -> list[TeamReport]:
         """One report, or as many as it takes to fit; the last of them has what is repeated, as far as there is room."""
-        moves = {item.t_ns: item for item in (self._closing, self._last, move) if item is not None}
+        recent = [*self._last] if move is None else [*self._last, move]
+        ends = [item for item in self._ends if recent and item.t_ns == recent[-1].anchor_ns]
+        moves = {item.t_ns: item for item in (*ends, *recent)}
         reckonings = tuple(moves[t_ns] for t_ns in sorted(moves))
         found, rest, repeats = [], list(fresh), list(self._repeats)
         while True:
@@ -91,7 +101,9 @@ class Teller:
             found.append(report)
         while not _fits(report := TeamReport(self._born_ns, reckonings, (*part, *repeats))):
             repeats.pop(0)
-        self._repeats, self._last = fresh, move or self._last
+        self._repeats = fresh
+        if move is not None:
+            self._last.append(move)
         return [*found, report]
 
 

@@ -1,7 +1,8 @@
 """Where one robot of a team is known to have moved: a chain of instants with its odometry since common anchors.
 
 What is heard late, twice or in another order leads to the same chain. Between two instants that share an anchor the
-motion is known, however much was lost in between; where the chain is broken (the robot has begun a new life) it coasts.
+motion is known, however much was lost in between, but not the places on the way; where the chain is broken (the robot
+has begun a new life) it coasts.
 """
 
 from __future__ import annotations
@@ -145,15 +146,16 @@ class Track:
                 return False
             node = self._nodes[index]
             if node.t_ns > t_ns + tolerance:
-                return _shared(at.node, node) is not None
+                # Within what was lost a robot may have been anywhere.
+                return node.even_ns <= at.node.t_ns and _shared(at.node, node) is not None
             at = Place(node.t_ns, node)
         return True
 
     def step(self, place: Place, until_ns: int) -> Step:
         """The next stretch from `place` towards `until_ns`, which is later: to the next instant of the chain at most.
 
-        Where the chain is broken the stretch leads to that instant, by coasting. Raises `ValueError` at the end of the
-        chain.
+        Where the chain is broken the stretch leads to that instant, by coasting; what `covers` an instant in between
+        is gone through evenly. Raises `ValueError` at the end of the chain.
         """
         index = bisect_right(self._stamps, place.t_ns)
         if index == len(self._stamps):
@@ -172,22 +174,7 @@ class Track:
         gone = end.t_ns - place.t_ns
         target = delta if end.delta is None else end.delta
         rest = target if place.delta is None else moved_between(place.delta, target)
-        noise = cov * (gone / whole) if gone < whole else cov
-        if node.even_ns > place.node.t_ns:
-            noise = noise + self._strayed(place, node) + self._strayed(end, node)
-        return Step(end, rest, noise, gone * 1e-9)
-
-    def _strayed(self, place: Place, node: Node) -> Array:
-        """How far the robot may be (4, 4) from the even way to `node` if what it told in between has not been heard.
-
-        Its velocity may have been another one before `place` than after, as when it coasts. Charged before and after,
-        it covers an error that is made up for at the node.
-        """
-        if place.delta is None:
-            return np.zeros((4, 4))
-        whole, gone = (node.t_ns - place.node.t_ns) * 1e-9, (place.t_ns - place.node.t_ns) * 1e-9
-        time_s = gone * (1.0 - gone / whole)
-        return self._coasted(time_s)
+        return Step(end, rest, cov * (gone / whole) if gone < whole else cov, gone * 1e-9)
 
     def _coasted(self, time_s: float) -> Array:
         spread, turn = (self._coast.speed_mps * time_s) ** 2, (self._coast.yaw_rate_radps * time_s) ** 2
