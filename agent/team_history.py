@@ -9,7 +9,7 @@ until it is. Only the data and not their order of arrival determine the belief, 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from agent.estimation.centralized import CentralizedFilter
 from agent.estimation.gaussian import is_positive_definite
 from agent.estimation.observation import OutOfViewError
-from agent.settings import AgentSettings
+from agent.settings import NS, AgentSettings
 from agent.team_track import Life, Node, Place, Track
 from agent.timeline import Phase
 from network.messages import RawMeasurement, Reckoning
@@ -30,8 +30,14 @@ Array = NDArray[np.float64]
 OWN: Life = (0, 0)
 """The own life, as far as the own chain is concerned."""
 
-MAX_WAITING = 4096
-"""Measurements within the horizon."""
+MAX_WAITING = 2048
+"""Measurements of one robot within the horizon: whoever tells more crowds nobody else out."""
+
+MAX_INSTANTS = 4096
+"""With more of them the horizon is cut short: each holds a joint belief."""
+
+OFFSET_JITTER_NS = 2 * NS
+"""What has left the horizon is known for longer by this: by another clock offset it would seem new."""
 
 
 class Fate(Enum):
@@ -129,6 +135,8 @@ class TeamHistory:
         self._stamps: list[int] = []
         self._made = 0
         self._known: dict[tuple[str, Life, int, int], Datum] = {}
+        self._past: deque[Datum] = deque()
+        self._waiting: Counter[str] = Counter()
         self.tracks: dict[str, Track] = {}
         self.begin(settings.robot, OWN, settings.start_ns, 0)
 
@@ -159,6 +167,9 @@ class TeamHistory:
         if robot == self._settings.robot:
             self._instant(reckoning.t_ns).own = True
             self._settle(reckoning.t_ns - self._settings.lateness.horizon_ns)
+            if len(self._stamps) > MAX_INSTANTS:
+                self._counters["replica.horizon_cut"] += 1
+                self._settle(min(self._stamps[-MAX_INSTANTS // 2], reckoning.t_ns))
 
     def measure(self, robot: str, life: Life, item: RawMeasurement, offset_ns: int) -> bool:
         """A measurement by a robot; False if it is too late or there are too many. One that is known is nothing new."""
@@ -167,9 +178,10 @@ class TeamHistory:
             return True
         if datum.t_ns <= self._settled_ns:
             return False
-        if len(self._known) >= MAX_WAITING:
+        if self._waiting[robot] >= MAX_WAITING:
             self._counters["replica.overflow"] += 1
             return False
+        self._waiting[robot] += 1
         self._known[datum.name] = datum
         instant = self._instant(datum.t_ns)
         instant.data.append(datum)
@@ -235,7 +247,7 @@ class TeamHistory:
                 if item.of is None
                 else belief.filter.observe(source, item.kind, item.of, item.z, item.R, item.mount)
             )
-            if nis is None or not is_positive_definite(belief.filter.belief(source)[1]):
+            if nis is None or not self._sound(belief, involved):
                 raise np.linalg.LinAlgError("covariance is not positive definite")
         except OutOfViewError:
             datum.fate = Fate.OUT_OF_VIEW
@@ -249,6 +261,12 @@ class TeamHistory:
             datum.applied = True
             self._applied(datum)
 
+    def _sound(self, belief: Belief, involved: list[str]) -> bool:
+        """Whether everything is finite, no variance is lost, and the robots concerned have a proper covariance."""
+        joint = belief.filter
+        proper = all(is_positive_definite(joint.belief(robot)[1]) for robot in (self._settings.robot, *involved))
+        return proper and bool(np.isfinite(joint.mean).all()) and bool(joint.cov.diagonal().min() > 0.0)
+
     def _covers(self, belief: Belief, robot: str, t_ns: int) -> bool:
         place = belief.places[robot]
         late = place.t_ns > t_ns + self._settings.lateness.tolerance_ns
@@ -261,7 +279,11 @@ class TeamHistory:
 
     def _step(self, belief: Belief, robot: str, until_ns: int) -> None:
         step = self.tracks[robot].step(belief.places[robot], until_ns)
-        belief.filter.odometry(robot, step.delta, step.cov, step.dt_s)
+        try:
+            belief.filter.odometry(robot, step.delta, step.cov, step.dt_s)
+        except np.linalg.LinAlgError:
+            self._counters["replica.bad_odometry"] += 1
+            belief.filter.odometry(robot, np.zeros(4), self.tracks[robot].coasted(step.dt_s), step.dt_s)
         belief.places[robot] = step.place
 
     def _close(self, belief: Belief, instant: Instant) -> None:
@@ -285,8 +307,11 @@ class TeamHistory:
         self._base = self._make(count)
         for instant in self._instants[:count]:
             for datum in instant.data:
-                del self._known[datum.name]
+                self._waiting[datum.source] -= 1
+                self._past.append(datum)
                 self._over(datum)
+        while self._past and self._past[0].t_ns <= self._settled_ns - OFFSET_JITTER_NS:
+            del self._known[self._past.popleft().name]
         del self._instants[:count], self._stamps[:count]
         self._made -= count
         for robot, place in self._base.places.items():

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.gaussian import symmetrize
 from agent.estimation.reckoning import increment, moved_between
 from agent.settings import CoastSettings
 from network.messages import Reckoning
@@ -26,7 +27,12 @@ Life = tuple[int, int]
 Anchor = tuple[Life, int]
 """A life and an instant of it by the robot's own clock: where sums of odometry begin."""
 
-MAX_NODES = 4096
+MAX_NODES = 8192
+"""The keeper cuts its horizon short long before its own chain is as long as this."""
+
+MAX_NAMES = 2 * MAX_NODES
+MAX_SUMS = 8
+"""Sums that lead to one node: a robot renews its anchor rarely."""
 NO_MOTION = np.zeros(4), np.zeros((4, 4))
 ROUNDING = 1e-9
 """How negative a covariance may come out of sums, relative to them."""
@@ -99,6 +105,9 @@ class Track:
     def _put(self, name: Anchor, new: Node, anchor: Anchor, total: tuple[Array, Array]) -> int | None:
         """Take in a sum that leads to a node which is new, unless it is known by its name or instant."""
         node = self._known.get(name)
+        if node is None and len(self._known) >= MAX_NAMES:
+            self._counters["replica.overflow"] += 1
+            return None
         if node is None:
             index = bisect_left(self._stamps, new.t_ns)
             if index < len(self._stamps) and self._stamps[index] == new.t_ns:
@@ -114,6 +123,9 @@ class Track:
                 self._stamps.insert(index, node.t_ns)
             self._known[name] = node
         if anchor in node.sums:
+            return None
+        if len(node.sums) >= MAX_SUMS:
+            self._counters["replica.overflow"] += 1
             return None
         node.sums[anchor] = total
         node.even_ns = min(node.even_ns, new.even_ns)
@@ -164,7 +176,7 @@ class Track:
         moved = self._moved(place.node, node)
         if moved is None:
             dt_s = (node.t_ns - place.t_ns) * 1e-9
-            return Step(Place(node.t_ns, node), np.zeros(4), self._coasted(dt_s), dt_s)
+            return Step(Place(node.t_ns, node), np.zeros(4), self.coasted(dt_s), dt_s)
         delta, cov = moved
         whole = node.t_ns - place.node.t_ns
         if node.t_ns <= until_ns + self._tolerance_ns:
@@ -176,7 +188,8 @@ class Track:
         rest = target if place.delta is None else moved_between(place.delta, target)
         return Step(end, rest, cov * (gone / whole) if gone < whole else cov, gone * 1e-9)
 
-    def _coasted(self, time_s: float) -> Array:
+    def coasted(self, time_s: float) -> Array:
+        """Covariance (4, 4) of where a robot may be after a time of which nothing is known."""
         spread, turn = (self._coast.speed_mps * time_s) ** 2, (self._coast.yaw_rate_radps * time_s) ** 2
         return np.diag([spread, spread, spread, turn])
 
@@ -186,12 +199,15 @@ class Track:
         if anchor is None:
             return None
         delta, cov = increment(*first.sums[anchor], *second.sums[anchor])
-        scale = float(np.abs(second.sums[anchor][1]).max())
-        if np.linalg.eigvalsh(cov)[0] < -ROUNDING * scale - 1e-15:
+        values, vectors = np.linalg.eigh(cov)
+        if values[0] >= 0.0:
+            return delta, cov
+        if values[0] < -ROUNDING * float(np.abs(second.sums[anchor][1]).max()) - 1e-15:
             # Not of one odometry: whoever told it is wrong somewhere.
             self._counters["replica.bad_odometry"] += 1
             return None
-        return delta, cov
+        # What sums leave of an exact zero, or a little more after a long time, is rounding.
+        return delta, symmetrize((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def _shared(first: Node, second: Node) -> Anchor | None:
