@@ -22,6 +22,7 @@ from agent.config_file import (
     validate,
 )
 from agent.config_parts import (
+    MAX_TEAM,
     AgentTargetPart,
     CalibrationPart,
     CoastPart,
@@ -45,10 +46,6 @@ from agent.sensor_input import SensorConfig
 from agent.settings import AgentSettings, nanoseconds
 
 _LOOPBACK = re.compile(r"\w+/(127\.\d+\.\d+\.\d+|localhost|\[::1\]):\d+(\?.*)?\Z")
-
-
-MAX_TEAM = 15
-"""Others of a team that share a joint belief: time and memory grow with powers of their number."""
 
 
 class IdentityPart(Part):

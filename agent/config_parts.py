@@ -33,6 +33,9 @@ from agent.settings import (
 from network.endpoint import EndpointSettings
 from network.links import LinkSettings
 
+MAX_TEAM = 15
+"""Others of a team that share a joint belief: time and memory grow with powers of their number."""
+
 
 class LocalizationPart(Part):
     kind: Literal["clat", "replica"] = "clat"
@@ -47,9 +50,11 @@ class LocalizationPart(Part):
         """`safe` uses a contact of a pair every 3 s and trace weights; `published` every one and log det.
 
         `split_joint` uses every contact, and caps innovations unless told otherwise; `replica` has no forms, and caps
-        them only if told. Raises `ConfigError` for a naive baseline without factors.
+        them only if told. Raises `ConfigError` for what the kind does not have, and for a naive baseline without
+        factors.
         """
         if self.kind == "replica":
+            self._refuse_what_pairs_need()
             return LocalizationSettings(
                 kind="replica", transform=self.transform, innovation_cap=self.innovation_cap or 0.0
             )
@@ -70,6 +75,18 @@ class LocalizationPart(Part):
             pair_timeout_ns=nanoseconds(self.pair_timeout_s),
             innovation_cap=cap,
         )
+
+
+    def _refuse_what_pairs_need(self) -> None:
+        """Raises `ConfigError` for keys of kind `clat`; a default that is stated is none."""
+        plain = LocalizationPart()
+        for key in ("form", "correlation", "pair_interval_s"):
+            stated, default = getattr(self, key), getattr(plain, key)
+            if stated != default:
+                remedy = f"leave {key} out" if default is None else f"leave {key} out, or say {key} = {default!r}"
+                raise ConfigError(
+                    f"{key} = {stated!r} is of kind 'clat', and kind 'replica' has no contacts of pairs; {remedy}"
+                )
 
 
 class TrackingPart(Part):

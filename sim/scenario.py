@@ -25,6 +25,7 @@ from agent.config_file import (
     validate,
 )
 from agent.config_parts import (
+    MAX_TEAM,
     CalibrationPart,
     CoastPart,
     ControlNoisePart,
@@ -356,6 +357,7 @@ def check(scenario: Scenario) -> None:
             f"there are: {', '.join(circling)}"
         )
     _check_steering(scenario)
+    _check_team(scenario)
     for robot in scenario.robots:
         _check_mover(f"{scenario.name}: robots.{robot.id}", robot)
         if recorded and LAYOUTS[robot.model].altitude is not None:
@@ -389,6 +391,24 @@ def check(scenario: Scenario) -> None:
             )
         if not recorded and target.start.pose is None:
             raise ConfigError(f"{scenario.name}: targets.{target.id}.start.pose is missing")
+
+
+def _check_team(scenario: Scenario) -> None:
+    """Either all robots tell each other raw data or none, and they are few."""
+    kinds = {robot.id: scenario.localization_of(robot).kind for robot in scenario.robots}
+    if "replica" not in kinds.values():
+        return
+    other = next((name for name, kind in kinds.items() if kind != "replica"), None)
+    if other is not None:
+        raise ConfigError(
+            f"{scenario.name}: robots.{other}.localization.kind = '{kinds[other]}' beside 'replica': who does not tell "
+            "its raw data is nowhere in the belief of the others; give all robots one kind"
+        )
+    if len(kinds) > MAX_TEAM + 1:
+        raise ConfigError(
+            f"{scenario.name}: localization.kind = 'replica' takes {MAX_TEAM + 1} robots at most, there are "
+            f"{len(kinds)}; take 'clat'"
+        )
 
 
 def _check_steering(scenario: Scenario) -> None:
