@@ -18,6 +18,7 @@ from agent.estimation.motion import CONSTANT_VELOCITY, PLANAR_MOTION, TargetMoti
 from agent.events import Event, Fix, Observation, Odometry, Received, Tick
 from agent.replica_filter import ReplicaFilter
 from agent.settings import NS, AgentSettings, LatenessSettings, LocalizationSettings, TargetSettings, TeamMember
+from agent.team_history import MAX_INSTANTS, MAX_WAITING
 from network.messages import (
     Channel,
     Epoch,
@@ -443,15 +444,126 @@ def test_late_own_data_are_dropped_if_so_configured() -> None:
     assert team.agents["r2"].counters["late.dropped"] == 1
 
 
-def test_memory_is_bounded() -> None:
+def many(k: int, t_ns: int) -> tuple[RawMeasurement, ...]:
+    return tuple(RawMeasurement(t_ns, 16 * k + i, "target:t1", "range", np.ones(1), np.eye(1)) for i in range(16))
+
+
+def test_memory_is_bounded_and_who_tells_too_much_crowds_out_nobody_else() -> None:
     agent = Agent(settings_of("r2"))
     agent.handle(Odometry(NS, 0, NS, np.zeros(4), NOISE))
-    for k in range(300):
-        items = tuple(RawMeasurement(NS, 16 * k + i, "target:t1", "range", np.ones(1), np.eye(1)) for i in range(16))
-        if 16 * k + 15 > 4095:
-            items = tuple(replace(item, t_ns=NS - 1, index=item.index - 4096) for item in items)
-        agent.handle(Received(NS, told_by("r1", *items)))
-    assert agent.counters["replica.overflow"] == 300 * 16 - 4096
+    for k in range(150):
+        agent.handle(Received(NS, told_by("r1", *many(k, NS))))
+    assert agent.counters["replica.overflow"] == 150 * 16 - MAX_WAITING
+    agent.handle(Received(NS, told_by("r3", *many(0, NS))))
+    agent.handle(Fix(NS, NS, "position", np.zeros(2), np.eye(2), "gps"))
+    agent.handle(Tick(NS))
+    assert agent.counters["replica.overflow"] == 150 * 16 - MAX_WAITING
+    assert agent.counters["late.dropped"] == 0
+
+
+def test_with_too_many_instants_the_horizon_is_cut_and_time_goes_on() -> None:
+    agent = Agent(settings_of("r2"))
+    filter_ = agent.filter
+    assert isinstance(filter_, ReplicaFilter)
+    step_ns = HORIZON_NS // (3 * MAX_INSTANTS)
+    for k in range(1, 2 * MAX_INSTANTS):
+        filter_.advance(k * step_ns, np.zeros(4), NOISE * 1e-3)
+        assert len(filter_._history._instants) <= MAX_INSTANTS
+    assert agent.counters["replica.horizon_cut"] >= 2
+    assert filter_.t_ns == (2 * MAX_INSTANTS - 1) * step_ns
+    assert np.isfinite(agent.estimate().mean).all()
+
+
+def test_what_has_left_the_horizon_is_nothing_new_by_another_clock_offset() -> None:
+    """r1's clock seems 10 ms off when a measurement is told again, which would bring it back into the horizon."""
+    horizon_ns = 3 * NS
+    team = Team(lateness=LatenessSettings(horizon_ns=horizon_ns, clock_sigma_ns=NS))
+    r2 = team.agents["r2"]
+    item = measured("target:t1")
+    r2.handle(Odometry(NS, 0, NS, np.zeros(4), NOISE))
+    message = Message(
+        Header("r1", 11, 1, 1, NS, NS),
+        TeamReport(0, (Reckoning(0, 0, NS, np.zeros(4), np.eye(4) * 1e-4),), (item,)),
+    )
+    r2.handle(Received(NS, message, 0, 1))
+    for k in range(2, 5):
+        r2.handle(Odometry(k * NS, (k - 1) * NS, k * NS, np.zeros(4), NOISE))
+    assert r2.counters["replica.used"] == 1
+    before = r2.estimate()
+    again = Message(Header("r1", 11, 1, 2, NS, NS), TeamReport(0, (), (item,)))
+    r2.handle(Received(4 * NS, again, -10_000_000, 1))
+    assert equal(r2.estimate(), before)
+    assert r2.counters["replica.too_late"] == 0
+    for k in range(5, 9):
+        r2.handle(Odometry(k * NS, (k - 1) * NS, k * NS, np.zeros(4), NOISE))
+    assert not filter_names(r2)
+
+
+def filter_names(agent: Agent) -> list[object]:
+    """Names of all measurements that are still known."""
+    assert isinstance(agent.filter, ReplicaFilter)
+    return list(agent.filter._history._known)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_no_valid_message_stops_a_robot_or_spoils_its_covariance(seed: int) -> None:
+    """Numbers of any size, sums that contradict each other, lives that begin anywhere, in messages that are valid."""
+    rng = np.random.default_rng(seed)
+    transform = ("unscented", "jacobian", "linearized")[seed % 3]
+    agent = Agent(
+        settings_of(
+            "r2",
+            lateness=LatenessSettings(horizon_ns=3 * NS),
+            localization=LocalizationSettings(kind="replica", transform=transform),  # type: ignore[arg-type]
+        )
+    )
+    incarnation = 1
+    for k in range(1, 13):
+        agent.handle(Odometry(k * NS, (k - 1) * NS, k * NS, np.array([0.5, 0.0, 0.0, 0.1]), NOISE))
+        for seq in range(3):
+            incarnation += rng.random() < 0.05
+            header = Header("r3", 11, incarnation, 3 * k + seq, k * NS, k * NS)
+            agent.handle(Received(k * NS, decode(encode(header, rubbish(rng, k * NS)), "r3")))
+        for of in ("target:t1", "r3"):
+            agent.handle(Observation(k * NS, k * NS, "range_bearing", of, np.array([3.0, 0.2]), R, "eye"))
+        agent.handle(Tick(k * NS))
+        estimate = agent.estimate()
+        assert estimate.t_ns == k * NS
+        for mean, cov in ((estimate.mean, estimate.cov), (estimate.tracks[0].mean, estimate.tracks[0].cov)):
+            assert np.isfinite(mean).all()
+            assert np.linalg.eigvalsh(cov)[0] > 0.0
+    assert len(filter_names(agent)) < 3 * 12 * 6 + 24
+
+
+def rubbish(rng: np.random.Generator, t_ns: int) -> TeamReport:
+    def values(size: int) -> Array:
+        return np.asarray(rng.normal(size=size) * 10.0 ** rng.uniform(-8.0, 8.0))
+
+    def cov(size: int) -> Array:
+        root = rng.normal(size=(size, size)) * 10.0 ** rng.uniform(-4.0, 3.0)
+        return np.asarray(root @ root.T + 1e-8 * np.eye(size))
+
+    born_ns = int(rng.choice([0, max(0, t_ns - int(rng.integers(1, 5)) * NS)]))
+    stamps = {t_ns - int(rng.integers(0, 4)) * NS - int(rng.integers(0, NS)) * int(rng.integers(0, 2)) for _ in range(3)}
+    reckonings = []
+    for stamp in sorted(stamp for stamp in stamps if stamp > born_ns):
+        anchor_ns = int(rng.integers(born_ns, stamp)) if rng.random() < 0.3 else born_ns
+        noise = cov(4) if rng.random() < 0.7 else np.zeros((4, 4))
+        reckonings.append(Reckoning(anchor_ns, int(rng.integers(anchor_ns, stamp)), stamp, values(4), noise))
+    measurements = []
+    sizes = {"range": 1, "bearing": 1, "range_bearing": 2, "bearing3": 2, "vector": 2, "pixel": 2}
+    alone = {"position": 3, "pose": 3, "heading": 1, "altitude": 1}
+    for index in range(1 + int(rng.integers(0, 5))):
+        of = (None, "r1", "r2", "target:t1", "landmark:gate")[int(rng.integers(0, 5))]
+        kinds = alone if of is None else sizes
+        kind = sorted(kinds)[int(rng.integers(0, len(kinds)))]
+        z = values(kinds[kind])
+        z[0] = abs(z[0])
+        mount = tuple((rng.normal(size=6) * 10.0 ** rng.uniform(-3.0, 6.0)).tolist())
+        stamp = max(0, t_ns - int(rng.integers(0, 4)) * NS)
+        measurements.append(RawMeasurement(stamp, index, of, kind, z, cov(len(z)), mount))  # type: ignore[arg-type]
+    return TeamReport(born_ns, tuple(reckonings), tuple(measurements))
 
 
 def test_figures_are_counted_once_a_measurement_leaves_the_horizon() -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from agent.estimation.reckoning import extended
 from agent.settings import NS, CoastSettings
 from agent.team_teller import Teller
-from agent.team_track import MAX_NODES, Life, Node, Place, Step, Track
+from agent.team_track import MAX_NAMES, MAX_NODES, MAX_SUMS, Life, Node, Place, Step, Track
 from network.messages import Reckoning
 
 Array = NDArray[np.float64]
@@ -211,3 +211,32 @@ def test_there_is_an_end_to_memory_and_to_the_chain() -> None:
     assert counters["replica.overflow"] == 4
     with pytest.raises(ValueError, match="covers"):
         made.step(Place(MAX_NODES, made.newest), 2 * MAX_NODES)
+
+
+def test_one_instant_takes_no_more_than_a_few_sums_and_names() -> None:
+    """Whoever makes up anchors or lives without end fills no memory."""
+    counters: Counter[str] = Counter()
+    made = Track(Node(0, 0), COAST, TOLERANCE, counters)
+    for k in range(100):
+        made.add(LIFE, Reckoning(k, k, NS, np.zeros(4), np.zeros((4, 4))), 0)
+    assert max(len(node.sums) for node in made._nodes) == MAX_SUMS
+    for k in range(2 * MAX_NAMES):
+        made.begin((2, k), NS, 0)
+    assert len(made._known) == MAX_NAMES
+    assert counters["replica.overflow"] > MAX_NAMES
+
+
+def test_an_exact_zero_of_the_noise_comes_out_of_long_sums_as_one() -> None:
+    """No increment has a negative variance, and none is taken for a contradiction."""
+    counters: Counter[str] = Counter()
+    start = Node(0, 0)
+    made, place = Track(start, COAST, TOLERANCE, counters), Place(0, start)
+    made.begin(LIFE, 0, 0)
+    total = np.zeros(4), np.zeros((4, 4))
+    for k in range(1, 500):
+        total = extended(*total, np.array([0.5, 0.0, 0.0, 0.3]), np.diag([0.01, 0.0, 0.0, 1e-6]))
+        made.add(LIFE, Reckoning(0, (k - 1) * NS, k * NS, *total), 0)
+    for step in walked(made, place, 499 * NS):
+        assert np.linalg.eigvalsh(step.cov)[0] > -1e-15
+        np.testing.assert_allclose(step.cov, np.diag([0.01, 0.0, 0.0, 1e-6]), atol=1e-9)
+    assert not counters
