@@ -218,11 +218,15 @@ def load_agent_config(path: Path) -> AgentConfig:
         config.initial.start_sigma.covariance(config.motion.model)
     except ConfigError as error:
         raise ConfigError(f"{path}: initial.{error}") from None
-    for member in config.team:
-        try:
+    try:
+        config.localization.settings()
+    except ConfigError as error:
+        raise ConfigError(f"{path}: localization: {error}") from None
+    try:
+        for member in config.team:
             member.settings()
-        except ConfigError as error:
-            raise ConfigError(f"{path}: {error}") from None
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
     if config.localization.kind == "replica" and not config.team:
         raise ConfigError(
             f"{path}: key 'team' is missing: localization.kind = 'replica' needs the id, mean, start_sigma and motion "

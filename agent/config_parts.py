@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 
 from agent.calibration import NO_CALIBRATION, Calibration
@@ -366,7 +366,7 @@ class TeamMemberPart(Part):
     """Another robot of the team: its belief at its start, and how it moves."""
 
     id: Id
-    mean: list[Finite]
+    mean: Annotated[list[Finite], Field(min_length=3, max_length=8)]
     start_sigma: SigmaPart
     motion: MotionPart = MotionPart()
 

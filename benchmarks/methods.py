@@ -1,7 +1,7 @@
-"""Every form of cooperative localization in every regime: `python -m benchmarks.methods`.
+"""Every method of cooperative localization in every regime: `python -m benchmarks.methods`.
 
-Plays the bundled scenarios with each form on the same data, beside the centralized filter, and prints a Markdown table:
-RMSE relative to the centralized filter's, and the ANEES per degree of freedom of the worst robot and the worst track.
+Plays the bundled scenarios with each method on the same data, beside the centralized filter, and prints a table in
+Markdown: RMSE relative to the centralized filter's, and the ANEES per degree of freedom of the worst robot and track.
 Trials that are finished stay in the output directory, so that an interrupted run goes on where it was.
 """
 
@@ -38,11 +38,13 @@ REGIMES = (
     Regime("dense-10-anchored", "the same, robot 1 has fixes", 10),
 )
 FORMS = ("split_joint", "safe", "published")
+METHODS = (*FORMS, "replica")
+"""Forms of kind `clat`, and the kind that has none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Figures of one form in one regime, and those of the centralized filter on the same trials."""
+    """Figures of one method in one regime, and those of the centralized filter on the same trials."""
 
     trials: int
     lost: int
@@ -87,16 +89,17 @@ def row(summary: dict[str, Any], fixed: str) -> Row:
 def table(rows: dict[tuple[str, str], Row]) -> str:
     """All rows in Markdown, one block per regime."""
     lines = [
-        "| scenario | form | lost | robots [m] | x bound | worst ANEES | median | tracks [m] | x bound | worst ANEES |",
+        "| scenario | method | lost | robots [m] | x bound | worst ANEES | median "
+        "| tracks [m] | x bound | worst ANEES |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for (scenario, form), found in rows.items():
+    for (scenario, method), found in rows.items():
         lines.append(
-            f"| `{scenario}` | `{form}` | {found.lost} of {found.trials} | {found.robots_m:.3f} "
+            f"| `{scenario}` | `{method}` | {found.lost} of {found.trials} | {found.robots_m:.3f} "
             f"| {found.robots_m / found.robots_bound_m:.2f} | {found.anees_max:.2f} | {found.anees_median:.2f} "
             f"| {found.track_m:.3f} | {found.track_m / found.track_bound_m:.2f} | {found.track_anees_max:.2f} |"
         )
-        if form == FORMS[-1]:
+        if method == METHODS[-1]:
             lines.append(
                 f"| | centralized | | {found.robots_bound_m:.3f} | 1 | {found.bound_anees_max:.2f} | "
                 f"| {found.track_bound_m:.3f} | 1 | {found.track_bound_anees:.2f} |"
@@ -105,11 +108,23 @@ def table(rows: dict[tuple[str, str], Row]) -> str:
 
 
 def play(regime: Regime, seed: int, share: float, folder: Path) -> dict[tuple[str, str], Row]:
-    """All forms of one regime. Raises `RuntimeError` if the run fails."""
+    """All methods of one regime. Raises `RuntimeError` if a run fails."""
     trials = max(2, round(share * regime.trials))
     out = folder / f"{regime.scenario}-{seed}-{trials}"
+    team = folder / f"{out.name}-replica"
     arguments = ["montecarlo", regime.scenario, "--trials", str(trials), "--seed", str(seed), "--bound"]
-    arguments += ["--vary", "localization.form=" + ",".join(FORMS), "--out", str(out)]
+    _run([*arguments, "--vary", "localization.form=" + ",".join(FORMS)], out)
+    _run([*arguments, "--set", "localization.kind=replica"], team)
+    found = {form: out / f"form={form}" for form in FORMS} | {"replica": team}
+    return {
+        (regime.scenario, method): row(json.loads((found[method] / "summary.json").read_text()), regime.fixed)
+        for method in METHODS
+    }
+
+
+def _run(arguments: list[str], out: Path) -> None:
+    """One command whose results are in `out`, going on where it was. Raises `RuntimeError` if it fails."""
+    arguments = [*arguments, "--out", str(out)]
     if out.exists():
         arguments.append("--resume")
     stdout, sys.stdout = sys.stdout, sys.stderr
@@ -118,11 +133,7 @@ def play(regime: Regime, seed: int, share: float, folder: Path) -> dict[tuple[st
     finally:
         sys.stdout = stdout
     if status != 0:
-        raise RuntimeError(f"{regime.scenario}: cofix {' '.join(arguments)} ended with status {status}")
-    return {
-        (regime.scenario, form): row(json.loads((out / f"form={form}" / "summary.json").read_text()), regime.fixed)
-        for form in FORMS
-    }
+        raise RuntimeError(f"cofix {' '.join(arguments)} ended with status {status}")
 
 
 def main(arguments: list[str] | None = None) -> int:

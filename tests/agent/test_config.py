@@ -103,6 +103,19 @@ def test_the_forms_stand_for_their_parts() -> None:
     assert LocalizationPart(form="published", pair_interval_s=2.0).settings().pair_interval_ns == 2_000_000_000
 
 
+def test_a_team_is_told_of_each_others_starts(tmp_path: Path) -> None:
+    """Stated defaults of what pairs have are not refused: resolved files state everything."""
+    localization = LocalizationPart(kind="replica").model_dump(exclude_none=True)
+    team = [{"id": "r2", "mean": [3.0, 4.0, 1.0], "start_sigma": {"position_m": 0.5, "heading_rad": 0.1}}]
+    made = load_agent_config(write(tmp_path, example(localization=localization, team=team))).settings(0)
+    assert (made.localization.kind, made.localization.innovation_cap) == ("replica", 0.0)
+    (mate,) = made.team
+    assert mate.id == "r2"
+    np.testing.assert_array_equal(mate.mean, [3.0, 4.0, 1.0])
+    np.testing.assert_allclose(mate.cov, np.diag([0.25, 0.25, 0.01]))
+    assert LocalizationPart(kind="replica", innovation_cap=4.0).settings().innovation_cap == 4.0
+
+
 def test_the_horizon_of_the_history_is_the_age_limit_of_messages() -> None:
     config = validate(AgentConfig, example(), "r1")
     assert config.network.settings(horizon_s=4.0).horizon_ns == 4_000_000_000
@@ -203,6 +216,7 @@ def test_a_targets_noise_is_that_which_drives_its_model() -> None:
 
 INITIAL = {"mean": [1.0, 2.0, 0.5], "start_sigma": {"position_m": 0.5, "heading_rad": 0.1}}
 TARGET = example()["targets"][0]
+MATE = {"id": "r2"} | INITIAL
 MISTAKES: list[tuple[dict[str, Any], list[str]]] = [
     ({"identty": {}}, ["'identty'", "did you mean 'identity'"]),
     ({"sensors": {"uwb": {"kind": "range", "munt": [0.0, 0.0, 0.0]}}}, ["'sensors.uwb.munt'", "did you mean 'mount'"]),
@@ -252,6 +266,26 @@ MISTAKES: list[tuple[dict[str, Any], list[str]]] = [
         ["clock.source", "mavlink.simulated = true"],
     ),
     ({"mavlink": {"endpoint": "udpin:127.0.0.1:14550"}, "injection": {"seed": 1}}, ["[injection]", "remove it"]),
+    ({"localization": {"correlation": "ignored"}}, ["localization: correlation = 'ignored'", "add form ="]),
+    ({"localization": {"kind": "replica"}}, ["key 'team' is missing", "every other robot"]),
+    (
+        {"localization": {"kind": "replica", "form": "safe"}, "team": [MATE]},
+        ["localization: form = 'safe'", "leave form out"],
+    ),
+    (
+        {"localization": {"kind": "replica", "correlation": "ignored"}, "team": [MATE]},
+        ["localization: correlation = 'ignored'", "leave correlation out"],
+    ),
+    (
+        {"localization": {"kind": "replica", "pair_interval_s": 2.0}, "team": [MATE]},
+        ["localization: pair_interval_s = 2.0", "leave pair_interval_s out"],
+    ),
+    ({"team": [MATE | {"id": "r1"}]}, ["team.r1 is this robot itself", "list the others only"]),
+    ({"team": [MATE, MATE]}, ["'r2' is used twice"]),
+    ({"team": [MATE | {"mean": [1.0]}]}, ["'team.r2.mean'", "at least 3"]),
+    ({"team": [MATE | {"motion": {"model": "planar_altitude"}}]}, ["team.r2: mean needs 4 numbers"]),
+    ({"team": [MATE | {"start_sigma": {"position_m": 1.0}}]}, ["team.r2: start_sigma.heading_rad is missing"]),
+    ({"team": [MATE | {"id": f"r{k}"} for k in range(2, 18)]}, ["'team'", "at most 15"]),
 ]
 
 

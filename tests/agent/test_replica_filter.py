@@ -545,7 +545,7 @@ def rubbish(rng: np.random.Generator, t_ns: int) -> TeamReport:
         return np.asarray(root @ root.T + 1e-8 * np.eye(size))
 
     born_ns = int(rng.choice([0, max(0, t_ns - int(rng.integers(1, 5)) * NS)]))
-    stamps = {t_ns - int(rng.integers(0, 4)) * NS - int(rng.integers(0, NS)) * int(rng.integers(0, 2)) for _ in range(3)}
+    stamps = {t_ns - int(rng.integers(0, 4)) * NS - int(rng.integers(0, 2) * rng.integers(0, NS)) for _ in range(3)}
     reckonings = []
     for stamp in sorted(stamp for stamp in stamps if stamp > born_ns):
         anchor_ns = int(rng.integers(born_ns, stamp)) if rng.random() < 0.3 else born_ns

@@ -158,6 +158,32 @@ MISTAKES: list[tuple[str, list[str]]] = [
 ]
 
 
+TEAM_MISTAKES: list[tuple[list[str], list[str]]] = [
+    (["localization.form=safe"], ["form = 'safe' is of kind 'clat'", "leave form out"]),
+    (["localization.correlation=ignored"], ["correlation = 'ignored'", "leave correlation out"]),
+    (["localization.pair_interval_s=1"], ["pair_interval_s = 1.0", "leave pair_interval_s out"]),
+    (["robots.r3.localization.kind=clat"], ["robots.r3.localization.kind = 'clat'", "give all robots one kind"]),
+]
+
+
+@pytest.mark.parametrize(("overrides", "words"), TEAM_MISTAKES, ids=[words[0] for _, words in TEAM_MISTAKES])
+def test_what_does_not_go_with_a_replica_is_refused(overrides: list[str], words: list[str]) -> None:
+    line = complaint("localization.kind=replica", *overrides)
+    for word in words:
+        assert word in line
+
+
+def test_a_team_too_large_for_a_joint_belief_is_refused(tmp_path: Path) -> None:
+    source = locate("dense-10").read_text()
+    first = source[source.index("[[robots]]") : source.index("[[robots]]", source.index("[[robots]]") + 1)]
+    more = "".join(first.replace('"r01"', f'"x{k}"') for k in range(7))
+    (tmp_path / "crowd.toml").write_text(source + more)
+    crowd = str(tmp_path / "crowd.toml")
+    assert len(load(crowd, []).robots) == 17
+    line = complaint("localization.kind=replica", name=crowd)
+    assert "16 robots at most, there are 17; take 'clat'" in line
+
+
 @pytest.mark.parametrize(("override", "words"), MISTAKES, ids=[override for override, _ in MISTAKES])
 def test_a_mistake_is_answered_with_the_key_and_the_remedy(override: str, words: list[str]) -> None:
     line = complaint(override)
