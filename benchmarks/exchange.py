@@ -76,14 +76,16 @@ class Bare:
     def __init__(self, request: int, reply: int) -> None:
         listen, self._request, answer = f"tcp/127.0.0.1:{free_port()}", bytes(request), bytes(reply)
         self._loop, self._back = asyncio.get_running_loop(), asyncio.Event()
-        self._asked = zenoh.open(_plain(listen=[listen]))
-        self._asking = zenoh.open(_plain(connect=[listen]))
+        self._asked: Any = zenoh.open(_plain(listen=[listen]))
+        self._asking: Any = zenoh.open(_plain(connect=[listen]))
         publisher = self._asked.declare_publisher("back")
         self._publisher = self._asking.declare_publisher("there")
+
+        def answered(_: Any) -> None:
+            publisher.put(answer)
+
         self._subscribers = [
-            self._asked.declare_subscriber(
-                "there", zenoh.handlers.Callback(lambda _: publisher.put(answer), indirect=False)
-            ),
+            self._asked.declare_subscriber("there", zenoh.handlers.Callback(answered, indirect=False)),
             self._asking.declare_subscriber("back", zenoh.handlers.Callback(self._arrived, indirect=False)),
         ]
 
