@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from agent.autopilot import AutopilotSettings
+from agent.autopilot_settings import AutopilotSettings
 from agent.calibration import Form
 from agent.config_file import (
     ConfigError,

@@ -16,7 +16,9 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from agent import frames
-from agent.autopilot import AutopilotReader, AutopilotSettings, _fix_settings
+from agent.autopilot import AutopilotReader
+from agent.autopilot_settings import AutopilotSettings
+from agent.autopilot_settings import fix_settings as settings_of_fixes
 from agent.estimation.motion import between, compose
 from agent.estimation.odometry import OdometryNoise
 from agent.events import Fix, Odometry
@@ -442,7 +444,7 @@ def test_a_vehicle_without_a_compass_tells_no_heading() -> None:
 
 
 def test_the_gps_own_vertical_accuracy_counts_when_it_is_worse() -> None:
-    fixes = VehicleFixes(_fix_settings(AutopilotSettings(origin=ORIGIN, fixes=("altitude",))), Counter())
+    fixes = VehicleFixes(settings_of_fixes(AutopilotSettings(origin=ORIGIN, fixes=("altitude",))), Counter())
     fixes.gps(T0, 3, 0, 7_000)
     (fix,) = fixes.global_position(T0, T0, 473_977_420, 85_455_940, 498_000, 0)
     assert np.allclose(fix.z, [10.0])

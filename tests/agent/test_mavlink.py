@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from agent.autopilot import AutopilotReader, AutopilotSettings, Output
+from agent.autopilot import AutopilotReader, Output
+from agent.autopilot_settings import AutopilotSettings
 from agent.events import Fix, Odometry
 from agent.fleet_clock import FleetClock
 from agent.mavlink import MavlinkError, MavlinkLink, SerialLine, parse_endpoint
