@@ -29,7 +29,7 @@ SAME_TARGET_M2 = 1e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moved:
-    """Prediction of a joint belief: mean (n,), F (n, n), and what P gains beyond F P F^T: own and target noise (n, n)."""
+    """Prediction of a joint belief: mean (n,), F (n, n), and P gains beyond F P F^T: own and target noise (n, n)."""
 
     mean: Array
     F: Array
@@ -66,7 +66,7 @@ class JointBelief(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Met:
-    """nu (m,) = H_i e_i + H_j e_j + v of two joint errors, v of covariance R (m, m), and the measurements' NIS per dof."""
+    """nu (m,) = H_i e_i + H_j e_j + v of two joint errors, v of covariance R (m, m), the measurements' NIS per dof."""
 
     nu: Array
     H_i: Array
@@ -170,7 +170,7 @@ class JointLayout:
 
     def common(self, told: JointBelief) -> list[tuple[slice, slice]]:
         """Components of the targets that both track with the same model: (own, theirs)."""
-        mine = {model: block for model, block in zip(self.models, self.blocks)}
+        mine = dict(zip(self.models, self.blocks))
         return [(mine[target], theirs) for target, theirs in _targets(told) if target in mine]
 
     def met(
