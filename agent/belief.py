@@ -3,6 +3,9 @@
 Correlations live in one matrix with a row per own state component: for every peer a factor sigma (P_ab =
 sigma_a sigma_b^T), the identity line Psi of its base contact, and the lines of contacts whose fate is
 unknown. Every local operation that maps the own error by A multiplies the whole matrix by A.
+
+If targets are part of the state, every line carries columns of their common process noise since its contact behind its
+Psi (see `agent.joint_factors`), and one block stands for what all robots have in common from the start.
 """
 
 from __future__ import annotations
@@ -24,9 +27,25 @@ class Part(IntEnum):
     FACTOR = 0
     BASE_LINE = 1
     LINE = 2
+    COMMON = 3
 
 
 BlockKey = tuple[Part, str, Epoch]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transition:
+    """Left factor F (n, n) of a prediction, and what it adds to the noise columns (n, c) of lines, if there are any."""
+
+    F: Array
+    noise: Array | None = None
+
+    def of_line(self, line: Array) -> Array:
+        """A line (n, n + c) after the prediction."""
+        after = np.asarray(self.F @ line)
+        if self.noise is not None:
+            after[:, len(after) :] += self.noise
+        return after
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +60,16 @@ class CorrelationStack:
         if not self.blocks:
             return self
         return CorrelationStack(A @ self.matrix, self.blocks)
+
+    def moved(self, step: Transition) -> CorrelationStack:
+        """All blocks after a prediction."""
+        stack = self.left(step.F)
+        if step.noise is not None:
+            columns = step.noise.shape[1]
+            for (part, _, _), (_, end) in stack.blocks.items():
+                if part is not Part.FACTOR:
+                    stack.matrix[:, end - columns : end] += step.noise
+        return stack
 
     def block(self, key: BlockKey) -> Array | None:
         span = self.blocks.get(key)
@@ -65,12 +94,13 @@ class PairRecord:
     """Book-keeping of one pair: the last contact applied, and contacts opened since whose fate is unknown.
 
     `known` is False when the correlation has been lost and zero may not be assumed yet; the pair's measurements
-    are not used until it has begun anew.
+    are not used until it has begun anew. `anew` tells that it has, and has no contact since.
     """
 
     base: Epoch = NEVER
     known: bool = True
     lines: tuple[Epoch, ...] = ()
+    anew: bool = False
 
 
 NO_PAIR = PairRecord()
@@ -137,5 +167,5 @@ class RobotState:
         return replace(
             self,
             stack=self.stack.changed({}, keys),
-            pairs={**self.pairs, peer: PairRecord(known=known)},
+            pairs={**self.pairs, peer: PairRecord(known=known, anew=True)},
         )

@@ -40,7 +40,9 @@ from agent.config_parts import (
     TeamMemberPart,
     TrackingPart,
 )
+from agent.estimation.motion import LAYOUTS
 from agent.estimation.observation import mount_of
+from agent.joint_room import check_room
 from agent.mavlink import MavlinkEndpointError, parse_endpoint
 from agent.sensor_input import SensorConfig
 from agent.settings import AgentSettings, nanoseconds
@@ -220,6 +222,9 @@ def load_agent_config(path: Path) -> AgentConfig:
         raise ConfigError(f"{path}: initial.{error}") from None
     try:
         config.localization.settings()
+        if config.localization.form == "joint":
+            followed = config.targets if config.tracking.kind != "none" else []
+            check_room(LAYOUTS[config.motion.model], [(target.id, LAYOUTS[target.model]) for target in followed])
     except ConfigError as error:
         raise ConfigError(f"{path}: localization: {error}") from None
     try:

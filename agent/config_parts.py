@@ -39,7 +39,7 @@ MAX_TEAM = 15
 
 class LocalizationPart(Part):
     kind: Literal["clat", "replica"] = "clat"
-    form: Literal["split_joint", "safe", "published"] = "split_joint"
+    form: Literal["split_joint", "safe", "published", "joint"] = "split_joint"
     transform: Literal["unscented", "linearized", "jacobian"] = "unscented"
     correlation: Literal["factors", "ignored"] = "factors"
     pair_interval_s: NotNegative | None = None
@@ -49,22 +49,23 @@ class LocalizationPart(Part):
     def settings(self) -> LocalizationSettings:
         """`safe` uses a contact of a pair every 3 s and trace weights; `published` every one and log det.
 
-        `split_joint` uses every contact, and caps innovations unless told otherwise; `replica` has no forms, and caps
-        them only if told. Raises `ConfigError` for what the kind does not have, and for a naive baseline without
-        factors.
+        `split_joint` and `joint` use every contact, and cap innovations unless told otherwise; `replica` has no forms,
+        and caps them only if told. Raises `ConfigError` for what the kind does not have, and for a naive baseline of
+        `split_joint` and `joint`.
         """
         if self.kind == "replica":
             self._refuse_what_pairs_need()
             return LocalizationSettings(
                 kind="replica", transform=self.transform, innovation_cap=self.innovation_cap or 0.0
             )
-        if self.correlation == "ignored" and self.form == "split_joint":
+        joint = self.form in ("split_joint", "joint")
+        if self.correlation == "ignored" and joint:
             raise ConfigError(
-                "correlation = 'ignored' is a baseline of the forms with factors; add form = 'published' or 'safe'"
+                "correlation = 'ignored' is a baseline of two forms only; add form = 'published' or 'safe'"
             )
         safe = self.form == "safe"
         interval_s = self.pair_interval_s if self.pair_interval_s is not None else (3.0 if safe else 0.0)
-        cap = self.innovation_cap if self.innovation_cap is not None else (9.0 if self.form == "split_joint" else 0.0)
+        cap = self.innovation_cap if self.innovation_cap is not None else (9.0 if joint else 0.0)
         return LocalizationSettings(
             form=self.form,
             transform=self.transform,
@@ -75,7 +76,6 @@ class LocalizationPart(Part):
             pair_timeout_ns=nanoseconds(self.pair_timeout_s),
             innovation_cap=cap,
         )
-
 
     def _refuse_what_pairs_need(self) -> None:
         """Raises `ConfigError` for keys of kind `clat`; a default that is stated is none."""

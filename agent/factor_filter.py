@@ -13,15 +13,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.belief import CorrelationStack, RobotState, TargetState
+from agent.belief import RobotState, TargetState
 from agent.effects import Effect, Estimate, Send, TrackEstimate
-from agent.estimation.colocalization import Options, absolute_update, sighting_update
+from agent.estimation.colocalization import Options, Update, sighting_update
 from agent.estimation.observation import AbsoluteModel, RelativeModel, relative_model
 from agent.events import LinkChange, Observation, Received
-from agent.history import History, moved
+from agent.factor_model import AnySnapshot, FactorModel, SeparateModel
+from agent.history import History
 from agent.pairs import Pairs
 from agent.settings import AgentSettings
-from network.messages import Body, Epoch, Measurement, PairReply, PairRequest, Snapshot, SplitRequest
+from network.messages import Body, Epoch, Measurement, PairReply, PairRequest, SplitRequest
 
 Array = NDArray[np.float64]
 
@@ -33,14 +34,14 @@ class FactorFilter:
         self, settings: AgentSettings, counters: Counter[str], count_nis: Callable[[str, float], None]
     ) -> None:
         self._settings, self._counters, self._count_nis = settings, counters, count_nis
-        stack = CorrelationStack(np.zeros((len(settings.mean), 0)))
-        targets = {t.id: TargetState(t.mean, t.cov) for t in settings.targets if settings.track}
-        self.state = RobotState(settings.start_ns, settings.mean, settings.cov, stack, {}, targets)
-        self._target_motions = {t.id: t.motion for t in settings.targets}
-        self.history = History(settings, self.state)
-        localization = settings.localization
-        self._options = Options(localization.transform, localization.parameters, localization.innovation_cap)
-        self._pairs = Pairs(settings, self._options, counters, count_nis)
+        self._motions = {t.id: t.motion for t in settings.targets}
+        self.model = self._model()
+        self.state = self.model.initial()
+        self.history = History(settings, self.model, self.state)
+        self._pairs = Pairs(settings, self.model, counters, count_nis)
+
+    def _model(self) -> FactorModel:
+        return SeparateModel(self._settings, self._counters)
 
     @property
     def t_ns(self) -> int:
@@ -51,20 +52,19 @@ class FactorFilter:
         return self.state
 
     def advance(self, t_ns: int, delta: Array, cov: Array) -> None:
-        self.state, F = moved(self._settings, self.state, t_ns, delta, cov)
-        self.history.advanced(self.state, delta, cov, F)
+        self.state = self.history.advance(self.state, t_ns, delta, cov)
 
     def estimate(self) -> Estimate:
         state = self.state
         tracks = tuple(
-            TrackEstimate(name, self._target_motions[name].layout.name, target.mean, target.cov)
+            TrackEstimate(name, self._motions[name].layout.name, target.mean, target.cov)
             for name, target in state.targets.items()
         )
         return Estimate(state.t_ns, self._settings.layout.name, state.mean, state.cov, tracks)
 
-    def snapshot(self, peer: str) -> Snapshot:
+    def snapshot(self, peer: str) -> AnySnapshot:
         """The present state as it would be told to a peer."""
-        return self._pairs.snapshot(self.state, peer)
+        return self.model.snapshot(self.state, peer)
 
     def contacts(self) -> dict[str, Epoch]:
         return {peer: record.base for peer, record in self.state.pairs.items() if record.base.met}
@@ -86,14 +86,23 @@ class FactorFilter:
         R: Array,
         landmark: str | None = None,
     ) -> None:
+        nis = self._use(t_ns, "late.compensated", "late.dropped", lambda then: self.model.absolute(then, model, z, R))
+        if nis is not None:
+            self._counters[f"used.{kind}"] += 1
+            self._count_nis(kind, nis)
+
+    def _use(
+        self, t_ns: int, late_used: str, late_lost: str, update_of: Callable[[RobotState], Update | None]
+    ) -> float | None:
+        """Update the state at `t_ns`, and what followed; returns the NIS per degree of freedom if that was possible."""
         late = self._late(t_ns)
         then: RobotState | None = self.state
         if late:
             then = None if self._settings.lateness.kind == "discard" else self.history.cut(t_ns)
         if then is None:
-            self._counters["late.dropped"] += 1
-            return
-        update = absolute_update(then.mean, then.cov, self._settings.layout, model, z, R, self._options)
+            self._counters[late_lost] += 1
+            return None
+        update = update_of(then)
         state: RobotState | None = None
         if update is not None and late:
             state = self.history.corrected(then.t_ns, update)
@@ -102,12 +111,11 @@ class FactorFilter:
             self.history.updated(state, update.left)
         if update is None or state is None:
             self._counters["update.not_positive_definite"] += 1
-            return
+            return None
         self.state = state
         if late:
-            self._counters["late.compensated"] += 1
-        self._counters[f"used.{kind}"] += 1
-        self._count_nis(kind, update.nis)
+            self._counters[late_used] += 1
+        return update.nis
 
     def sighting(self, t_ns: int, target: str, event: Observation) -> None:
         if target not in self.state.targets:
@@ -120,7 +128,7 @@ class FactorFilter:
         late = then is not self.state
         belief = then.targets[target]
         localization = self._settings.localization
-        motion = self._target_motions[target]
+        motion = self._motions[target]
         layout = motion.layout
         own, track, nis = sighting_update(
             (then.mean, then.cov, self._settings.layout),
@@ -130,7 +138,7 @@ class FactorFilter:
             event.R,
             localization.sighting_weight,
             localization.correlation == "factors",
-            self._options,
+            Options(localization.transform, localization.parameters, localization.innovation_cap),
         )
         self._count_nis(f"target_{event.kind}", nis)
         self._counters["used.sighting_own"] += own is not None
@@ -177,13 +185,14 @@ class FactorFilter:
         return body.epoch.t_meas_ns - self._pairs.clocks.offset_ns(event)
 
     def requested(self, event: Received, t_ns: int, effects: list[Effect]) -> None:
-        if not isinstance(event.message.body, PairRequest):
+        body = event.message.body
+        if not isinstance(body, PairRequest) or not isinstance(body.snapshot, self.model.snapshot_type):
             self._counters["pair.other_form"] += 1
             return
         self.state = self._pairs.request(event, t_ns, self.state, self.history, effects)
 
     def replied(self, peer: str, body: Body) -> None:
-        if not isinstance(body, PairReply):
+        if not isinstance(body, PairReply) or not isinstance(body.snapshot, self.model.snapshot_type | None):
             self._counters["pair.other_form"] += 1
             return
         self.state = self._pairs.reply(peer, body, self.state, self.history)

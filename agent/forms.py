@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from agent.cooperative_filter import CooperativeFilter
 from agent.factor_filter import FactorFilter
+from agent.joint_filter import JointFilter
 from agent.replica_filter import ReplicaFilter
 from agent.settings import AgentSettings
 from agent.split_filter import SplitFilter
@@ -20,4 +21,6 @@ def build_filter(
         return ReplicaFilter(settings, counters, count_nis)
     if settings.localization.form == "split_joint":
         return SplitFilter(settings, counters, count_nis)
+    if settings.localization.form == "joint":
+        return JointFilter(settings, counters, count_nis)
     return FactorFilter(settings, counters, count_nis)

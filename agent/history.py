@@ -18,10 +18,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.belief import BlockKey, CorrelationStack, Part, RobotState, TargetState
+from agent.belief import BlockKey, CorrelationStack, Part, RobotState, Transition
 from agent.estimation.colocalization import Update
 from agent.estimation.gaussian import gain, is_positive_definite, symmetrize, wrap_components
 from agent.estimation.motion import split_increment
+from agent.factor_model import FactorModel
 from agent.settings import AgentSettings
 from network.messages import Epoch
 
@@ -32,39 +33,23 @@ MAX_ENTRIES = 4096
 
 @dataclass(slots=True, eq=False)
 class Entry:
-    """A state, the increment (4,) with covariance (4, 4) and left factor F that led to it, updates since."""
+    """A state, the increment (4,) with covariance (4, 4) and the step that led to it, left factors of updates since."""
 
     state: RobotState
     delta: Array
     delta_cov: Array
-    F: Array
+    step: Transition
     after: Array
-
-
-def moved(
-    settings: AgentSettings, state: RobotState, t_ns: int, delta: Array, cov: Array
-) -> tuple[RobotState, Array]:
-    """State and targets predicted to `t_ns` with an odometry increment; returns (state, F (n, n))."""
-    localization = settings.localization
-    dt_s = (t_ns - state.t_ns) * 1e-9
-    own = settings.motion.advance(state.mean, state.cov, delta, cov, dt_s, localization.transform)
-    targets = {}
-    for target in settings.targets:
-        belief = state.targets.get(target.id)
-        if belief is not None:
-            drifted = target.motion.drift(belief.mean, belief.cov, dt_s, localization.transform)
-            targets[target.id] = TargetState(drifted.mean, drifted.cov, belief.updated_ns)
-    return RobotState(t_ns, own.mean, own.cov, state.stack.left(own.F), state.pairs, targets), own.F
 
 
 class History:
     """Ring of entries over `settings.lateness.horizon_ns`."""
 
-    def __init__(self, settings: AgentSettings, state: RobotState) -> None:
-        self._settings = settings
+    def __init__(self, settings: AgentSettings, model: FactorModel, state: RobotState) -> None:
+        self._settings, self._model = settings, model
         self._stamps: list[int] = [state.t_ns]
         identity = np.eye(len(state.mean))
-        self._entries = [Entry(state, np.zeros(4), np.zeros((4, 4)), identity, identity)]
+        self._entries = [Entry(state, np.zeros(4), np.zeros((4, 4)), Transition(identity), identity)]
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -73,11 +58,13 @@ class History:
     def oldest_ns(self) -> int:
         return self._stamps[0]
 
-    def advanced(self, state: RobotState, delta: Array, delta_cov: Array, F: Array) -> None:
-        """The newest state has moved to a later instant."""
-        self._entries.append(Entry(state, delta, delta_cov, F, np.eye(len(state.mean))))
+    def advance(self, state: RobotState, t_ns: int, delta: Array, delta_cov: Array) -> RobotState:
+        """Move the newest state, `state`, to the later instant `t_ns` by an odometry increment; returns it."""
+        state, step = self._model.moved(state, t_ns, delta, delta_cov)
+        self._entries.append(Entry(state, delta, delta_cov, step, np.eye(len(state.mean))))
         self._stamps.append(state.t_ns)
         self._trim()
+        return state
 
     def _trim(self) -> None:
         oldest = self._stamps[-1] - self._settings.lateness.horizon_ns
@@ -111,14 +98,10 @@ class History:
         following = self._entries[index + 1]
         share = (t_ns - self._stamps[index]) / (self._stamps[index + 1] - self._stamps[index])
         first, first_cov, second, second_cov = split_increment(following.delta, following.delta_cov, share)
-        state, F = moved(self._settings, entry.state, t_ns, first, first_cov)
-        localization = self._settings.localization
-        rest_s = (self._stamps[index + 1] - t_ns) * 1e-9
-        rest = self._settings.motion.advance(
-            state.mean, state.cov, second, second_cov, rest_s, localization.transform
-        )
-        following.delta, following.delta_cov, following.F = second, second_cov, rest.F
-        self._entries.insert(index + 1, Entry(state, first, first_cov, F, np.eye(len(state.mean))))
+        state, step = self._model.moved(entry.state, t_ns, first, first_cov)
+        _, rest = self._model.moved(state, self._stamps[index + 1], second, second_cov)
+        following.delta, following.delta_cov, following.step = second, second_cov, rest
+        self._entries.insert(index + 1, Entry(state, first, first_cov, step, np.eye(len(state.mean))))
         self._stamps.insert(index + 1, t_ns)
         self._trim()
         return state
@@ -126,11 +109,12 @@ class History:
     def opened(self, t_ns: int, peer: str, epoch: Epoch) -> RobotState:
         """Open a contact's identity line at `t_ns`, an entry's instant, in all states since; returns the newest."""
         first = bisect_left(self._stamps, t_ns)
-        psi = np.eye(len(self._entries[first].state.mean))
+        n = len(self._entries[first].state.mean)
+        line = np.eye(n, n + self._model.noise_columns)
         for index, entry in enumerate(self._entries[first:]):
             if index:
-                psi = entry.after @ (entry.F @ psi)
-            entry.state = entry.state.with_line(peer, epoch, psi, self._settings.localization.max_lines)
+                line = entry.after @ entry.step.of_line(line)
+            entry.state = entry.state.with_line(peer, epoch, line, self._settings.localization.max_lines)
         return self._entries[-1].state
 
     def first_with(self, key: BlockKey) -> RobotState | None:
@@ -155,17 +139,16 @@ class History:
         """
         first = bisect_left(self._stamps, t_ns)
         before = self._entries[first].state
-        angles = self._settings.layout.angles
-        shift = wrap_components(update.mean - before.mean, angles)
+        shift = wrap_components(update.mean - before.mean, self._model.layout.angles)
         lost = before.cov - update.cov
         states = [_based(before, before.updated(update.mean, update.cov, update.left), base)]
         later = self._entries[first + 1 :]
         correction = _StackCorrection(before, update.left) if later else None
         psi = np.eye(len(before.mean))
         for entry in later:
-            psi = entry.after @ (entry.F @ psi)
+            psi = entry.after @ (entry.step.F @ psi)
             state = entry.state
-            mean = wrap_components(state.mean + psi @ shift, angles)
+            mean = wrap_components(state.mean + psi @ shift, self._model.layout.angles)
             cov = symmetrize(state.cov - psi @ lost @ psi.T)
             if not is_positive_definite(cov):
                 return None
@@ -185,7 +168,7 @@ def _based(before: RobotState, after: RobotState, base: tuple[str, Epoch, Array]
     peer, epoch, cross = base
     line = before.stack.block((Part.LINE, peer, epoch))
     assert line is not None
-    return after.with_base(peer, epoch, line @ cross, line)
+    return after.with_base(peer, epoch, line[:, : len(cross)] @ cross, line)
 
 
 class _StackCorrection:

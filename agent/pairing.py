@@ -33,7 +33,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from network.messages import Epoch, Measurement, PairReply, PairRequest, ReplyStatus, Snapshot
+from network.messages import Epoch, JointSnapshot, Measurement, PairReply, PairRequest, ReplyStatus, Snapshot
 
 
 class Step(Enum):
@@ -118,7 +118,7 @@ class PairExchange:
         return Step.OPEN
 
     def open(
-        self, t_ns: int, now_ns: int, measurements: tuple[Measurement, ...], snapshot: Snapshot
+        self, t_ns: int, now_ns: int, measurements: tuple[Measurement, ...], snapshot: Snapshot | JointSnapshot
     ) -> PairRequest:
         """Open a contact; the caller keeps an identity line for the request's epoch and sends the request."""
         self._counter += 1

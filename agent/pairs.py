@@ -9,39 +9,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.belief import Part, RobotState, TargetState
+from agent.belief import Part, RobotState
 from agent.effects import Effect, Send
-from agent.estimation.colocalization import (
-    Options,
-    contact,
-    pair_update,
-)
-from agent.estimation.gaussian import symmetrize, wrap_components
-from agent.estimation.intersection import fuse
-from agent.estimation.motion import STATES
+from agent.estimation.colocalization import pair_update
 from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError
 from agent.events import LinkChange, Received
+from agent.factor_model import AnySnapshot, FactorModel
 from agent.history import History
 from agent.pair_clock import PairClocks
 from agent.pairing import PairExchange, Step
 from agent.settings import AgentSettings
-from network.messages import (
-    MAX_LINES,
-    MAX_MEASUREMENTS,
-    MAX_MESSAGE_BYTES,
-    MAX_TARGETS,
-    NEVER,
-    Belief,
-    Epoch,
-    Line,
-    Measurement,
-    PairReply,
-    PairRequest,
-    ReplyStatus,
-    Snapshot,
-    TargetBelief,
-)
-from network.wire import size_bound
+from network.messages import MAX_MEASUREMENTS, Epoch, Measurement, PairReply, PairRequest, ReplyStatus
 
 Array = NDArray[np.float64]
 
@@ -54,17 +32,16 @@ class Pairs:
     def __init__(
         self,
         settings: AgentSettings,
-        options: Options,
+        model: FactorModel,
         counters: Counter[str],
         count_nis: Callable[[str, float], None],
     ) -> None:
         self._count_nis = count_nis
-        self._settings, self._options, self._counters = settings, options, counters
+        self._settings, self._model, self._counters = settings, model, counters
         self._exchanges: dict[str, PairExchange] = {}
         self._lives: dict[str, tuple[int, int]] = {}
         self._inflated_ns: dict[str, int] = {}
         self.clocks = PairClocks(settings)
-        self._motions = {target.id: target.motion for target in settings.targets}
 
     def exchange(self, peer: str) -> PairExchange:
         if peer not in self._exchanges:
@@ -93,44 +70,6 @@ class Pairs:
             elif waiting and exchange.pending is None:
                 self._counters["pair.timed_out"] += 1
 
-    def snapshot(self, state: RobotState, peer: str) -> Snapshot:
-        """The state as it is told to a peer."""
-        record = state.pair(peer)
-        n = len(state.mean)
-        factor = state.stack.block((Part.FACTOR, peer, NEVER))
-        line = state.stack.block((Part.BASE_LINE, peer, NEVER))
-        lines = []
-        for epoch in record.lines[-MAX_LINES:]:
-            block = state.stack.block((Part.LINE, peer, epoch))
-            assert block is not None
-            lines.append(Line(epoch, block))
-        targets = tuple(
-            TargetBelief(name, Belief(self._motions[name].layout.name, target.mean, target.cov))
-            for name, target in list(state.targets.items())[:MAX_TARGETS]
-        )
-        return Snapshot(
-            Belief(self._settings.layout.name, state.mean, state.cov),
-            record.base,
-            np.zeros((n, 0)) if factor is None else factor,
-            np.eye(n) if line is None else line,
-            tuple(lines),
-            targets,
-            record.known,
-        )
-
-    def _fitting(self, snapshot: Snapshot, measurements: tuple[Measurement, ...]) -> Snapshot:
-        """The snapshot without what does not fit into one message: targets first, then the oldest lines."""
-        longest = Epoch(2**62, "r" * 24, 2**53)
-        while (snapshot.targets or snapshot.lines) and (
-            size_bound(PairRequest(longest, measurements, snapshot)) > MAX_MESSAGE_BYTES
-        ):
-            self._counters["pair.shortened"] += 1
-            if snapshot.targets:
-                snapshot = replace(snapshot, targets=snapshot.targets[:-1])
-            else:
-                snapshot = replace(snapshot, lines=snapshot.lines[1:])
-        return snapshot
-
     # -- what happens to a pair -----------------------------------------------------------------------------
 
     def measured(
@@ -153,7 +92,16 @@ class Pairs:
             self._counters["pair.too_old_own"] += 1
             return state, None
         told = tuple(self.clocks.widened(peer, item) for item in measurements[:MAX_MEASUREMENTS])
-        request = exchange.open(t_ns, now_ns, told, self._fitting(self.snapshot(then, peer), told))
+        full = self._model.snapshot(then, peer)
+        snapshot = self._model.fitting(full, peer, told, None)
+        while snapshot is None and len(told) > 1:
+            self._counters["pair.measurement_left_out"] += 1
+            told = told[:-1]
+            snapshot = self._model.fitting(full, peer, told, None)
+        if snapshot is None:
+            self._counters["pair.too_large"] += 1
+            return state, None
+        request = exchange.open(t_ns, now_ns, told, snapshot)
         self._counters["pair.started"] += 1
         return history.opened(then.t_ns, peer, request.epoch), request
 
@@ -165,7 +113,7 @@ class Pairs:
         request = event.message.body
         assert isinstance(request, PairRequest)
         epoch = request.epoch
-        if epoch.initiator != peer or not self._fits(request.snapshot) or not _known_kinds(request):
+        if epoch.initiator != peer or not self._model.usable(request.snapshot) or not _known_kinds(request):
             self._counters["pair.malformed"] += 1
             return state
         exchange = self.exchange(peer)
@@ -183,7 +131,11 @@ class Pairs:
             self._counters["pair.too_old"] += 1
             effects.append(Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.TOO_OLD))))
             return state
-        own = self._fitting(self.snapshot(then, peer), ())
+        own = self._model.fitting(self._model.snapshot(then, peer), peer, (), request.snapshot)
+        if own is None:
+            self._counters["pair.too_large"] += 1
+            effects.append(Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.BUSY))))
+            return state
         effects.append(Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.OK, own))))
         state = history.opened(then.t_ns, peer, epoch)
         return self._apply(peer, epoch, request.snapshot, own, request.measurements, False, t_ns, state, history)
@@ -199,7 +151,7 @@ class Pairs:
             return state
         if step is not Step.APPLY or pending is None or reply.snapshot is None:
             return state
-        if not self._fits(reply.snapshot):
+        if not self._model.usable(reply.snapshot):
             self._counters["pair.malformed"] += 1
             return state
         sent = pending.request
@@ -249,25 +201,12 @@ class Pairs:
 
     # -- estimation -----------------------------------------------------------------------------------------
 
-    def _fits(self, told: Snapshot) -> bool:
-        """Whether a peer's snapshot is of a robot and of the sizes that the pair's algebra needs."""
-        layout = STATES.get(told.belief.model)
-        if layout is None or layout.heading is None:
-            return False
-        square = (layout.dim, layout.dim)
-        return (
-            told.belief.cov.shape == square
-            and (not told.base.met or told.factor.shape == (layout.dim, self._settings.layout.dim))
-            and told.line.shape == square
-            and all(line.matrix.shape == square for line in told.lines)
-        )
-
     def _apply(
         self,
         peer: str,
         epoch: Epoch,
-        initiator: Snapshot,
-        responder: Snapshot,
+        initiator: AnySnapshot,
+        responder: AnySnapshot,
         measurements: tuple[Measurement, ...],
         own_initiated: bool,
         t_ns: int,
@@ -279,14 +218,7 @@ class Pairs:
         other = responder if own_initiated else initiator
         own_is_low = self._settings.robot < peer
         try:
-            found = contact(
-                initiator,
-                responder,
-                own_is_low == own_initiated,
-                measurements,
-                correlated,
-                self._options,
-            )
+            found = self._model.contact(initiator, responder, own_is_low == own_initiated, measurements)
         except OutOfViewError:
             self._counters["pair.out_of_view"] += 1
             return state
@@ -295,8 +227,8 @@ class Pairs:
             return state
         key = (Part.LINE, peer, epoch)
         then = history.first_with(key)
-        psi = None if then is None else then.stack.block(key)
-        if then is None or psi is None:
+        line = None if then is None else then.stack.block(key)
+        if then is None or line is None:
             self._counters["pair.line_lost"] += 1
             return state
         if found.cross is None:
@@ -305,42 +237,19 @@ class Pairs:
             history.updated(state)
             return state
         C_own = found.C_i if own_initiated else found.C_j
-        update = pair_update(then.mean, then.cov, self._settings.layout, psi, C_own, found)
+        psi = line[:, : len(line)]
+        update = pair_update(then.mean, then.cov, self._model.layout, psi, C_own, found)
         after = found.cross_after if own_initiated else found.cross_after.T
         base = (peer, epoch, after if correlated else np.zeros_like(after))
         corrected = None if update is None else history.corrected(then.t_ns, update, base)
         if update is None or corrected is None:
             self._counters["update.not_positive_definite"] += 1
             return state
-        state = self._fuse_targets(other, t_ns, corrected, correlated)
+        state = self._model.fused(other, t_ns, corrected)
         history.updated(state)
         self._count_nis("pair_" + "+".join(item.kind for item in measurements), update.nis)
         self._counters["pair.applied_initiator" if own_initiated else "pair.applied_responder"] += 1
         return state
-
-    def _fuse_targets(self, other: Snapshot, t_ns: int, state: RobotState, correlated: bool) -> RobotState:
-        """Intersect the peer's target beliefs, predicted to the state's instant, with the own ones."""
-        localization = self._settings.localization
-        targets = dict(state.targets)
-        for told in other.targets:
-            own = targets.get(told.target)
-            motion = self._motions.get(told.target)
-            if own is None or motion is None or told.belief.model != motion.layout.name:
-                self._counters["target.unknown"] += 1
-                continue
-            mean, cov = told.belief.mean, told.belief.cov
-            if state.t_ns > t_ns:
-                drifted = motion.drift(mean, cov, (state.t_ns - t_ns) * 1e-9, localization.transform)
-                mean, cov = drifted.mean, drifted.cov
-            angles = motion.layout.angles
-            if correlated:
-                mean, cov, _ = fuse(own.mean, own.cov, mean, cov, angles, localization.fusion_weight)
-            else:
-                gain = own.cov @ np.linalg.inv(own.cov + cov)
-                mean = wrap_components(own.mean + gain @ wrap_components(mean - own.mean, angles), angles)
-                cov = symmetrize(own.cov - gain @ own.cov)
-            targets[told.target] = TargetState(mean, cov, state.t_ns)
-        return replace(state, targets=targets) if targets else state
 
 
 def _known_kinds(request: PairRequest) -> bool:

@@ -15,7 +15,7 @@ from agent.estimation.colocalization import Options, absolute_update
 from agent.estimation.motion import UNICYCLE, compose
 from agent.estimation.observation import RelativeModel
 from agent.estimation.unscented import DEFAULT
-from agent.history import moved
+from agent.factor_model import moved
 from agent.settings import AgentSettings, LocalizationSettings
 from network.messages import NEVER
 

@@ -25,7 +25,7 @@ MAX_LINES = 4
 
 MAX_STATE_DIM = 8
 MAX_JOINT_DIM = 16
-"""Components of a robot and its targets together in one split belief."""
+"""Components of a robot and its targets together in one belief."""
 
 MAX_TARGETS = 8
 MAX_MEASUREMENTS = 8
@@ -120,7 +120,10 @@ class TargetBelief:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Line:
-    """Accumulated left factors (n, n) of the sender's error since a contact not yet known to be applied."""
+    """Accumulated left factors (n, n) of the sender's error since a contact not yet known to be applied.
+
+    In a `JointSnapshot` the columns of common noise since then follow, (n, n + c), or are left out.
+    """
 
     epoch: Epoch
     matrix: Array
@@ -144,6 +147,39 @@ class Snapshot:
     lines: tuple[Line, ...] = ()
     targets: tuple[TargetBelief, ...] = ()
     known: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointSnapshot:
+    """A robot and its targets as one belief with correlation factors, at a contact's instant and before its update.
+
+    mean (n,), cov (n, n) over the robot's state followed by those of `targets` (id, model), in order: c components.
+    Only what the correlation needs is told, the rest is None:
+
+    base    the last contact of the pair the sender applied
+    factor  (n, m) as in `Snapshot`
+    line    (n, n) left factors since `base`
+    noise   (n, c) covariance of the error with the targets' process noise since `base`, or since the start of a pair
+            that never met, over `span_s` seconds: the white noise of each component, summed and scaled to unit variance
+    prior   (n, c) columns of the targets' common prior, of a pair that never met
+    lines   later contacts the sender opened and does not know the fate of, oldest first
+    known   as in `Snapshot`
+    anew    the pair began again from zero correlation: prior and noise from before do not count
+    """
+
+    model: str
+    targets: tuple[tuple[str, str], ...]
+    mean: Array
+    cov: Array
+    base: Epoch
+    factor: Array | None = None
+    line: Array | None = None
+    noise: Array | None = None
+    prior: Array | None = None
+    span_s: float = 0.0
+    lines: tuple[Line, ...] = ()
+    known: bool = True
+    anew: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,7 +211,7 @@ class PairRequest:
 
     epoch: Epoch
     measurements: tuple[Measurement, ...]
-    snapshot: Snapshot
+    snapshot: Snapshot | JointSnapshot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,7 +220,7 @@ class PairReply:
 
     epoch: Epoch
     status: ReplyStatus
-    snapshot: Snapshot | None = None
+    snapshot: Snapshot | JointSnapshot | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

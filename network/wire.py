@@ -7,6 +7,7 @@ row. Everything is validated before a value is handed on: a decoded message sati
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from itertools import pairwise
@@ -26,9 +27,12 @@ from network.messages import (
     SCHEMA,
     Body,
     ClockEcho,
+    Epoch,
     Header,
     Hello,
+    JointSnapshot,
     Line,
+    Measurement,
     Message,
     PairReply,
     PairRequest,
@@ -43,13 +47,16 @@ from network.messages import (
 from network.wire_fields import (
     BELIEF_FLOOR,
     FULL,
+    MAX_ABS,
     WireError,
+    checked_cov,
     is_part,
     pack_array,
     pack_belief,
     pack_cov,
     pack_epoch,
     pack_measurement,
+    pack_single,
     read_array,
     read_belief,
     read_contact,
@@ -61,11 +68,14 @@ from network.wire_fields import (
     read_integer,
     read_items,
     read_measurement,
+    read_single,
+    read_single_or_none,
     read_text,
 )
 from network.wire_team import pack_report, read_report
 
 _HELLO, _PAIR_REQUEST, _PAIR_REPLY, _SPLIT_REQUEST, _SPLIT_REPLY, _TEAM_REPORT = 1, 2, 3, 4, 5, 6
+_JOINT_REQUEST, _JOINT_REPLY = 7, 8
 _HEADER_BYTES = 3 + 25 + 5 * 9 + 1
 """Upper bound of what surrounds a body: array marks, schema, longest source, five integers, kind."""
 
@@ -131,8 +141,13 @@ def _pack_body(body: Body) -> tuple[int, tuple[Any, ...]]:
         return _HELLO, (body.software, echoes)
     if isinstance(body, PairRequest):
         measurements = tuple(pack_measurement(m) for m in body.measurements)
-        return _PAIR_REQUEST, (pack_epoch(body.epoch), measurements, _pack_snapshot(body.snapshot))
+        epoch = pack_epoch(body.epoch)
+        if isinstance(body.snapshot, JointSnapshot):
+            return _JOINT_REQUEST, (epoch, measurements, _pack_joint(body.snapshot))
+        return _PAIR_REQUEST, (epoch, measurements, _pack_snapshot(body.snapshot))
     if isinstance(body, PairReply):
+        if isinstance(body.snapshot, JointSnapshot):
+            return _JOINT_REPLY, (pack_epoch(body.epoch), _pack_joint(body.snapshot))
         snapshot = None if body.snapshot is None else _pack_snapshot(body.snapshot)
         return _PAIR_REPLY, (pack_epoch(body.epoch), int(body.status), snapshot)
     if isinstance(body, SplitRequest):
@@ -164,6 +179,28 @@ def _pack_split(snapshot: SplitSnapshot) -> tuple[Any, ...]:
     n = len(snapshot.mean)
     private = None if snapshot.private is None else pack_cov(snapshot.private, n)
     return snapshot.model, snapshot.targets, pack_array(snapshot.mean, (n,)), pack_cov(snapshot.cov, n), private
+
+
+def _pack_joint(snapshot: JointSnapshot) -> tuple[Any, ...]:
+    n = len(snapshot.mean)
+    c = n - read_dim(snapshot.model)
+    columns = 0 if snapshot.factor is None else snapshot.factor.shape[-1]
+    return (
+        snapshot.model,
+        snapshot.targets,
+        pack_array(snapshot.mean, (n,)),
+        pack_cov(snapshot.cov, n, "<f4"),
+        pack_epoch(snapshot.base),
+        columns,
+        pack_single(snapshot.factor, (n, columns)),
+        pack_single(snapshot.line, (n, n)),
+        pack_single(snapshot.noise, (n, c)),
+        pack_single(snapshot.prior, (n, c)),
+        float(snapshot.span_s),
+        tuple((pack_epoch(line.epoch), pack_single(line.matrix, line.matrix.shape)) for line in snapshot.lines),
+        snapshot.known,
+        snapshot.anew,
+    )
 
 
 # --- decoding ---------------------------------------------------------------------------------------------
@@ -277,7 +314,8 @@ def _hello(raw: Any, header: Header) -> Hello:
     return Hello(software, tuple(echoes))
 
 
-def _pair_request(raw: Any, header: Header) -> PairRequest:
+def _opened(raw: Any, header: Header) -> tuple[Epoch, tuple[Measurement, ...], Any]:
+    """Epoch, measurements and the unread snapshot of a request."""
     epoch_raw, measurements_raw, snapshot = read_fields(raw, 3)
     epoch = read_contact(epoch_raw)
     if epoch.initiator != header.source:
@@ -285,6 +323,11 @@ def _pair_request(raw: Any, header: Header) -> PairRequest:
     measurements = tuple(read_measurement(item) for item in read_items(measurements_raw, MAX_MEASUREMENTS))
     if not measurements:
         raise WireError("malformed")
+    return epoch, measurements, snapshot
+
+
+def _pair_request(raw: Any, header: Header) -> PairRequest:
+    epoch, measurements, snapshot = _opened(raw, header)
     return PairRequest(epoch, measurements, _snapshot(snapshot))
 
 
@@ -299,40 +342,85 @@ def _pair_reply(raw: Any, header: Header) -> PairReply:
     return PairReply(read_contact(epoch), ReplyStatus(status), snapshot)
 
 
-def _split(raw: Any) -> SplitSnapshot:
-    model, targets_raw, mean, cov_raw, private_raw = read_fields(raw, 5)
+def _robot_and_targets(model: Any, targets_raw: Any) -> tuple[tuple[tuple[str, str], ...], int, int]:
+    """Targets (id, model) of a joint belief, its size and that of the targets together."""
     targets = []
     for item in read_items(targets_raw, MAX_TARGETS):
         name, target_model = read_fields(item, 2)
         targets.append((read_id(name), read_text(target_model)))
     if len({name for name, _ in targets}) != len(targets):
         raise WireError("malformed")
-    n = read_dim(model) + sum(read_dim(target_model) for _, target_model in targets)
+    c = sum(read_dim(target_model) for _, target_model in targets)
+    n = read_dim(model) + c
     if n > MAX_JOINT_DIM:
         raise WireError("out_of_range")
+    return tuple(targets), n, c
+
+
+def _split(raw: Any) -> SplitSnapshot:
+    model, targets_raw, mean, cov_raw, private_raw = read_fields(raw, 5)
+    targets, n, _ = _robot_and_targets(model, targets_raw)
     cov = read_cov(cov_raw, n, BELIEF_FLOOR, "not_positive_definite")
     private = None
     if private_raw is not None:
         private = read_array(private_raw, n * (n + 1) // 2)[FULL[n]]
         if not is_part(private, cov):
             raise WireError("not_positive_definite")
-    return SplitSnapshot(model, tuple(targets), read_array(mean, n), cov, private)
+    return SplitSnapshot(model, targets, read_array(mean, n), cov, private)
+
+
+def _joint(raw: Any) -> JointSnapshot:
+    fields = read_fields(raw, 14)
+    model, targets_raw, mean, cov, base, columns, factor, line, noise, prior, span_s, lines_raw, known, anew = fields
+    targets, n, c = _robot_and_targets(model, targets_raw)
+    m = read_integer(columns, MAX_JOINT_DIM)
+    if type(known) is not bool or type(anew) is not bool or type(span_s) is not float:
+        raise WireError("wrong_type")
+    if not 0.0 <= span_s <= MAX_ABS:
+        raise WireError("out_of_range" if math.isfinite(span_s) else "non_finite")
+    lines = []
+    for item in read_items(lines_raw, MAX_LINES):
+        epoch, matrix = read_fields(item, 2)
+        wide = type(matrix) is bytes and len(matrix) > 4 * n * n
+        lines.append(Line(read_contact(epoch), read_single(matrix, n, n + c if wide else n)))
+    if any(later.epoch <= earlier.epoch for earlier, later in pairwise(lines)):
+        raise WireError("malformed")
+    packed = read_single(cov, n * (n + 1) // 2)
+    return JointSnapshot(
+        model=model,
+        targets=targets,
+        mean=read_array(mean, n),
+        cov=checked_cov(packed, n, BELIEF_FLOOR, "not_positive_definite"),
+        base=read_epoch(base),
+        factor=read_single_or_none(factor, n, m),
+        line=read_single_or_none(line, n, n),
+        noise=read_single_or_none(noise, n, c),
+        prior=read_single_or_none(prior, n, c),
+        span_s=span_s,
+        lines=tuple(lines),
+        known=known,
+        anew=anew,
+    )
 
 
 def _split_request(raw: Any, header: Header) -> SplitRequest:
-    epoch_raw, measurements_raw, snapshot = read_fields(raw, 3)
-    epoch = read_contact(epoch_raw)
-    if epoch.initiator != header.source:
-        raise WireError("source_mismatch")
-    measurements = tuple(read_measurement(item) for item in read_items(measurements_raw, MAX_MEASUREMENTS))
-    if not measurements:
-        raise WireError("malformed")
+    epoch, measurements, snapshot = _opened(raw, header)
     return SplitRequest(epoch, measurements, _split(snapshot))
 
 
 def _split_reply(raw: Any, header: Header) -> SplitReply:
     epoch, snapshot = read_fields(raw, 2)
     return SplitReply(read_contact(epoch), _split(snapshot))
+
+
+def _joint_request(raw: Any, header: Header) -> PairRequest:
+    epoch, measurements, snapshot = _opened(raw, header)
+    return PairRequest(epoch, measurements, _joint(snapshot))
+
+
+def _joint_reply(raw: Any, header: Header) -> PairReply:
+    epoch, snapshot = read_fields(raw, 2)
+    return PairReply(read_contact(epoch), ReplyStatus.OK, _joint(snapshot))
 
 
 _STATUSES = frozenset(int(status) for status in ReplyStatus)
@@ -343,4 +431,6 @@ _BODIES: dict[int, Callable[[Any, Header], Body]] = {
     _SPLIT_REQUEST: _split_request,
     _SPLIT_REPLY: _split_reply,
     _TEAM_REPORT: read_report,
+    _JOINT_REQUEST: _joint_request,
+    _JOINT_REPLY: _joint_reply,
 }

@@ -5,6 +5,7 @@ Functions `pack_*` raise ValueError for what breaks a rule, `read_*` raise WireE
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
@@ -86,15 +87,20 @@ def pack_epoch(epoch: Epoch) -> tuple[int, str, int]:
     return epoch.t_meas_ns, epoch.initiator, epoch.counter
 
 
-def pack_array(array: Array, shape: tuple[int, ...]) -> bytes:
-    values = np.asarray(array, dtype="<f8")
+def pack_array(array: Array, shape: tuple[int, ...], dtype: str = "<f8") -> bytes:
+    values = np.asarray(array, dtype=dtype)
     if values.shape != shape:
         raise ValueError(f"array of shape {values.shape} where {shape} belongs")
     return values.tobytes()
 
 
-def pack_cov(cov: Array, n: int) -> bytes:
-    values = np.asarray(cov, dtype="<f8")
+def pack_single(array: Array | None, shape: tuple[int, ...]) -> bytes:
+    """An array in single precision; nothing for None."""
+    return b"" if array is None else pack_array(array, shape, "<f4")
+
+
+def pack_cov(cov: Array, n: int, dtype: str = "<f8") -> bytes:
+    values = np.asarray(cov, dtype=dtype)
     if values.shape != (n, n) or n not in _TRIU:
         raise ValueError(f"covariance of shape {values.shape} where {(n, n)} belongs")
     if np.abs(values - values.T).max() > 1e-6 * np.abs(values).max():
@@ -167,6 +173,23 @@ def read_array(raw: Any, count: int) -> Array:
     return values
 
 
+def read_single(raw: Any, *shape: int) -> Array:
+    """Finite values of single precision and magnitude at most MAX_ABS."""
+    if type(raw) is not bytes:
+        raise WireError("wrong_type")
+    if len(raw) != 4 * math.prod(shape):
+        raise WireError("malformed")
+    values = np.frombuffer(raw, dtype="<f4").astype(np.float64)
+    if not values.dot(values) <= MAX_ABS**2:
+        _refuse_if_bad(values)
+    return values.reshape(shape)
+
+
+def read_single_or_none(raw: Any, *shape: int) -> Array | None:
+    """`read_single`, or None for no bytes at all."""
+    return None if raw == b"" else read_single(raw, *shape)
+
+
 def _refuse_if_bad(values: Array) -> None:
     if not np.isfinite(values).all():
         raise WireError("non_finite")
@@ -176,7 +199,11 @@ def _refuse_if_bad(values: Array) -> None:
 
 def read_cov(raw: Any, n: int, floor: float, below: str) -> Array:
     """(n, n) symmetric positive definite matrix whose conditional variances are not below `floor`."""
-    packed = read_array(raw, n * (n + 1) // 2)
+    return checked_cov(read_array(raw, n * (n + 1) // 2), n, floor, below)
+
+
+def checked_cov(packed: Array, n: int, floor: float, below: str) -> Array:
+    """The matrix (n, n) of a packed upper triangle; see `read_cov`."""
     if n == 1:
         variance = packed[0]
         if variance < floor:

@@ -48,6 +48,7 @@ from agent.config_parts import (
 )
 from agent.estimation.motion import LAYOUTS, TargetMotion
 from agent.estimation.observation import RELATIVE_ANGLES, mount_of
+from agent.joint_room import check_room
 from agent.sensor_input import SensorConfig
 from agent.settings import nanoseconds
 
@@ -365,9 +366,13 @@ def check(scenario: Scenario) -> None:
                 f"{scenario.name}: robots.{robot.id}.model = '{robot.model}' has an altitude, and recordings are "
                 "planar; take 'unicycle'"
             )
-        scenario.lateness_of(robot), scenario.tracking_of(robot)
+        scenario.lateness_of(robot)
+        localization, tracking = scenario.localization_of(robot), scenario.tracking_of(robot)
         try:
-            scenario.localization_of(robot).settings()
+            localization.settings()
+            if localization.form == "joint":
+                followed = scenario.targets if tracking.kind != "none" else []
+                check_room(LAYOUTS[robot.model], [(target.id, LAYOUTS[target.model]) for target in followed])
         except ConfigError as error:
             raise ConfigError(f"{scenario.name}: localization: {error}") from None
         if not recorded and (robot.start.pose is None) == (robot.start.circle is None):

@@ -75,10 +75,10 @@ def absolute_update(
     predicted = observe(model.h, model.jacobian, mean, cov, model.angles, options.transform, options.parameters)
     innovation = _innovation(predicted, z, model.angles)
     S, nis = _capped(innovation, predicted.cov + R, options.innovation_cap)
-    return _applied(mean, cov, layout, gain(predicted.cross, S), S, innovation, nis, predicted.H)
+    return applied(mean, cov, layout, gain(predicted.cross, S), S, innovation, nis, predicted.H)
 
 
-def _applied(
+def applied(
     mean: Array,
     cov: Array,
     layout: StateLayout,
@@ -88,7 +88,10 @@ def _applied(
     nis: float,
     H: Array | None = None,
 ) -> Update | None:
-    """`H` spares a solution where K S = P H^T: P+ P^-1 = 1 - K H then."""
+    """x += K nu, P -= K S K^T; None when that is not positive definite.
+
+    `H` spares a solution where K S = P H^T: P+ P^-1 = 1 - K H then.
+    """
     posterior = symmetrize(cov - K @ S @ K.T)
     if not is_positive_definite(posterior):
         return None
@@ -137,8 +140,8 @@ def sighting_update(
     if not correlated:
         S = own_term + target_term + noise
         return (
-            _applied(own_mean, own_cov, own_layout, gain(own_cov @ H_own.T, S), S, innovation, nis),
-            _applied(target_mean, target_cov, target_layout, gain(target_cov @ H_target.T, S), S, innovation, nis),
+            applied(own_mean, own_cov, own_layout, gain(own_cov @ H_own.T, S), S, innovation, nis),
+            applied(target_mean, target_cov, target_layout, gain(target_cov @ H_target.T, S), S, innovation, nis),
             nis,
         )
     results: list[Update | None] = []
@@ -270,5 +273,5 @@ def pair_update(
 
     `left` = P+ P^-1 is the rule for third parties (UT-CLAT eq. 28): exact for psi = I, an approximation otherwise.
     """
-    return _applied(mean, cov, layout, gain(psi @ C_own, found.S), found.S, found.innovation, found.nis)
+    return applied(mean, cov, layout, gain(psi @ C_own, found.S), found.S, found.innovation, found.nis)
 

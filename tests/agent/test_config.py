@@ -90,9 +90,10 @@ def test_without_tracking_no_target_is_tracked() -> None:
 
 
 def test_the_forms_stand_for_their_parts() -> None:
-    split, safe, published = (
-        LocalizationPart(form=form).settings() for form in ("split_joint", "safe", "published")
+    split, safe, published, joint = (
+        LocalizationPart(form=form).settings() for form in ("split_joint", "safe", "published", "joint")
     )
+    assert (joint.pair_interval_ns, joint.innovation_cap) == (0, 9.0)
     assert LocalizationPart().settings() == split
     assert (split.pair_interval_ns, split.innovation_cap) == (0, 9.0)
     assert (safe.innovation_cap, published.innovation_cap) == (0.0, 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,8 @@ from agent.core import Agent
 from agent.estimation.colocalization import Update
 from agent.estimation.motion import compose
 from agent.events import Event, Fix, Observation, Odometry, Tick
-from agent.history import MAX_ENTRIES, History, moved
+from agent.factor_model import SeparateModel
+from agent.history import MAX_ENTRIES, History
 from agent.settings import NS, AgentSettings, LatenessSettings, LocalizationSettings
 from network.messages import Epoch
 from tests.agent.courier import FIRST, SECOND, TINY, Pair
@@ -223,11 +225,10 @@ def since(history: History, t_ns: int) -> tuple[RobotState, Array]:
 def filled(count: int, horizon_ns: int = 60 * NS) -> tuple[History, RobotState]:
     base = plain(horizon_ns=horizon_ns)
     state = RobotState(0, base.mean, base.cov, CorrelationStack(np.zeros((3, 0))))
-    history = History(base, state)
+    history = History(base, SeparateModel(base, Counter()), state)
     for k in range(count):
         event = drive(k)
-        state, F = moved(base, state, event.t_meas_ns, event.delta, event.cov)
-        history.advanced(state, event.delta, event.cov, F)
+        state = history.advance(state, event.t_meas_ns, event.delta, event.cov)
     return history, state
 
 

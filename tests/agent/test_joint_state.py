@@ -82,7 +82,7 @@ def test_tracks_are_told_and_found_by_name() -> None:
     mine, theirs = model("unscented", ("t1", "t2", "t3")), model("unscented", ("t3", "t1"))
     told = theirs.snapshot(theirs.initial(), ("t3", "t1"))
     state = mine.initial()
-    assert mine._common(state, told) == [(slice(11, 15), slice(3, 7)), (slice(3, 7), slice(7, 11))]
+    assert mine._layout.common(told) == [(slice(11, 15), slice(3, 7)), (slice(3, 7), slice(7, 11))]
     only = mine.snapshot(state, ("t2",))
     assert only.targets == (("t2", "constant_velocity"),)
     assert np.array_equal(only.mean, np.concatenate([state.mean[:3], state.mean[7:11]]))

@@ -52,7 +52,7 @@ WRONG: list[tuple[list[str], str]] = [
     (["run", "ut-clat", "--set", "links.loss"], "KEY=VALUE"),
     (["run", "ut-clat", "--set", "robots.r9.id=r2"], "there are: r1, r2, r3, r4"),
     (["run", "ut-clat", "--set", "robots.r2.sensors.range.sigma_cm=5"], "did you mean 'sigma_m'?"),
-    (["run", "ut-clat", "--set", "robots.r2.localization.form=bad"], "'split_joint', 'safe' or 'published'"),
+    (["run", "ut-clat", "--set", "robots.r2.localization.form=bad"], "'split_joint', 'safe', 'published' or 'joint'"),
     (["run", "ut-clat", "--duration", "100"], "window_s starts at 200 s"),
     (["run", "ut-clat", "--duration", "-1"], "--duration"),
     (["run", "ut-clat", "--duration", "nan"], "--duration"),

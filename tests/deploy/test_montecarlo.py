@@ -327,7 +327,7 @@ def test_variants_go_on_and_may_become_more(desk: Desk, compared: list[tuple[Pat
 def test_a_variant_that_is_no_scenario_is_refused_before_anything_is_made(desk: Desk) -> None:
     status, _, err = desk(*SHORT, "--trials", "1", "--vary", "localization.form=safe,bold", "--out", "one")
     assert (status, len(err.splitlines())) == (2, 1)
-    assert "'split_joint', 'safe' or 'published'" in err
+    assert "'split_joint', 'safe', 'published' or 'joint'" in err
     assert list(desk.folder.iterdir()) == []
 
 

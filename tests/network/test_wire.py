@@ -30,6 +30,7 @@ from network.messages import (
     Epoch,
     Header,
     Hello,
+    JointSnapshot,
     Line,
     Measurement,
     Message,
@@ -114,6 +115,22 @@ def example_report() -> TeamReport:
     )
 
 
+def example_joint(met: bool = True) -> JointSnapshot:
+    """A robot and a target with factors; of a pair that met, or with what all have in common."""
+    found = JointSnapshot(
+        model="unicycle",
+        targets=(("t1", "constant_velocity"),),
+        mean=np.arange(7.0) / 4,
+        cov=example_split().cov.astype(np.float32).astype(float),
+        base=Epoch(400, "r2", 3) if met else NEVER,
+    )
+    if not met:
+        return dataclasses.replace(found, noise=np.eye(7, 4) / 2, prior=np.eye(7, 4, -3), span_s=2.5, known=False)
+    lines = (Line(Epoch(500, "r1", 4), 0.5 * np.eye(7)), Line(Epoch(600, "r1", 5), np.eye(7, 11) / 4))
+    factor = np.arange(21.0).reshape(7, 3) / 16
+    return dataclasses.replace(found, factor=factor, line=np.eye(7) + 0.125, lines=lines, anew=True)
+
+
 EXAMPLES: dict[str, Body] = {
     "hello": Hello("0.1.0", (ClockEcho("r2", 10, 20), ClockEcho("r3", 30, 40))),
     "pair_request": example_request(),
@@ -123,6 +140,8 @@ EXAMPLES: dict[str, Body] = {
     "split_request": SplitRequest(Epoch(1_000, "r1", 9), example_request().measurements, example_split()),
     "split_reply": SplitReply(Epoch(1_000, "r2", 9), example_split(private=False)),
     "team_report": example_report(),
+    "joint_request": PairRequest(Epoch(1_000, "r1", 9), example_request().measurements, example_joint()),
+    "joint_reply": PairReply(Epoch(1_000, "r2", 9), ReplyStatus.OK, example_joint(met=False)),
 }
 
 
@@ -197,13 +216,51 @@ def snapshots(draw: st.DrawFn) -> Snapshot:
 
 
 @st.composite
-def split_snapshots(draw: st.DrawFn) -> SplitSnapshot:
+def robots_and_targets(draw: st.DrawFn) -> tuple[str, tuple[tuple[str, str], ...], int]:
+    """Model, targets and number of components of a joint belief."""
     models = sorted(MODEL_DIMS)
     model, names = draw(st.sampled_from(models)), draw(st.lists(ids, max_size=2, unique=True))
     targets = tuple((name, draw(st.sampled_from(models))) for name in names)
     while MODEL_DIMS[model] + sum(MODEL_DIMS[item] for _, item in targets) > MAX_JOINT_DIM:
         targets = targets[:-1]
-    n = MODEL_DIMS[model] + sum(MODEL_DIMS[item] for _, item in targets)
+    return model, targets, MODEL_DIMS[model] + sum(MODEL_DIMS[item] for _, item in targets)
+
+
+def singles(*shape: int) -> st.SearchStrategy[np.ndarray]:
+    """Arrays of what single precision can hold, told apart by a few numbers in them."""
+    number = st.floats(-1e9, 1e9, width=32, allow_subnormal=False)
+    size = int(np.prod(shape))
+    return st.lists(number, min_size=1, max_size=5).map(lambda v: np.resize(np.array(v), size).reshape(shape))
+
+
+@st.composite
+def joint_snapshots(draw: st.DrawFn) -> JointSnapshot:
+    model, targets, n = draw(robots_and_targets())
+    c = n - MODEL_DIMS[model]
+    line_epochs = sorted(draw(st.lists(epochs, max_size=2, unique=True)))
+    cov = draw(covariances(n))
+    # An empty array is told as nothing.
+    columns = st.none() if c == 0 else st.one_of(st.none(), singles(n, c))
+    return JointSnapshot(
+        model=model,
+        targets=targets,
+        mean=draw(arrays(n)),
+        cov=(cov + np.diag(cov.diagonal())).astype(np.float32).astype(float),
+        base=draw(st.one_of(st.just(NEVER), epochs)),
+        factor=draw(st.one_of(st.none(), singles(n, draw(st.integers(1, 8))))),
+        line=draw(st.one_of(st.none(), singles(n, n))),
+        noise=draw(columns),
+        prior=draw(columns),
+        span_s=draw(st.floats(0.0, 1e9)),
+        lines=tuple(Line(epoch, draw(singles(n, n + draw(st.sampled_from([0, c]))))) for epoch in line_epochs),
+        known=draw(st.booleans()),
+        anew=draw(st.booleans()),
+    )
+
+
+@st.composite
+def split_snapshots(draw: st.DrawFn) -> SplitSnapshot:
+    model, targets, n = draw(robots_and_targets())
     share = draw(st.one_of(st.none(), st.floats(0.0, 1.0)))
     cov = draw(covariances(n))
     return SplitSnapshot(model, targets, draw(arrays(n)), cov, None if share is None else share * cov)
@@ -244,7 +301,8 @@ def raw_measurements(draw: st.DrawFn, source: str, t_ns: int, index: int) -> Raw
 @st.composite
 def messages(draw: st.DrawFn) -> Message:
     header = Header(draw(ids), *(draw(stamps) for _ in range(5)))
-    kind = draw(st.sampled_from(["hello", "request", "reply", "split request", "split reply", "report"]))
+    kinds = ["hello", "request", "reply", "split request", "split reply", "report", "joint"]
+    kind = draw(st.sampled_from(kinds))
     body: Body
     if kind == "hello":
         peers = sorted(draw(st.lists(ids, max_size=MAX_ECHOES, unique=True)))
@@ -262,6 +320,11 @@ def messages(draw: st.DrawFn) -> Message:
         body = SplitRequest(epoch, tuple(measured), draw(split_snapshots()))
     elif kind == "report":
         body = draw(reports(header.source, header.t_meas_ns))
+    elif kind == "joint":
+        epoch = Epoch(draw(stamps), header.source, draw(stamps))
+        body = PairRequest(epoch, (draw(measurements()),), draw(joint_snapshots()))
+        if draw(st.booleans()):
+            body = PairReply(epoch, ReplyStatus.OK, draw(joint_snapshots()))
     elif kind == "split reply":
         body = SplitReply(draw(epochs), draw(split_snapshots()))
     else:
@@ -324,6 +387,10 @@ def measured_with(**changes: Any) -> TeamReport:
     return report_with(measurements=(dataclasses.replace(first, **changes), *others))
 
 
+def joint_with(**changes: Any) -> PairReply:
+    return PairReply(Epoch(1_000, "r2", 9), ReplyStatus.OK, dataclasses.replace(example_joint(), **changes))
+
+
 def test_too_many_lines_and_targets_for_one_datagram_are_an_oversize_error() -> None:
     lines = tuple(Line(Epoch(500 + k, "r1", k), EYE) for k in range(MAX_LINES))
     belief = Belief("constant_velocity", np.zeros(4), np.eye(4))
@@ -373,6 +440,18 @@ def test_too_many_lines_and_targets_for_one_datagram_are_an_oversize_error() -> 
         measured_with(z=np.array([-1.0])),
         measured_with(R=-np.eye(1)),
         measured_with(index=MAX_INDEX + 1),
+        joint_with(factor=np.zeros((3, 7))),
+        joint_with(line=np.zeros((7, 3))),
+        joint_with(noise=np.zeros((7, 3))),
+        joint_with(prior=np.zeros((3, 4))),
+        joint_with(prior=np.full((7, 4), np.inf)),
+        joint_with(lines=(Line(Epoch(500, "r1", 4), np.zeros((7, 8))),)),
+        joint_with(cov=-np.eye(7)),
+        joint_with(mean=np.zeros(3)),
+        joint_with(targets=(("t1", "hovercraft"),)),
+        joint_with(span_s=-1.0),
+        joint_with(known=1),
+        PairRequest(Epoch(1, "r2", 1), example_request().measurements, example_joint()),
         Hello("spaces and <markup>"),
         Hello("1", (ClockEcho("r2", 1, 1), ClockEcho("r2", 1, 1))),
         Hello("1", (ClockEcho("r2", -1, 1),)),
@@ -389,6 +468,10 @@ def test_a_malformed_own_message_is_a_value_error(body: Any) -> None:
 
 def doubles(*values: float) -> bytes:
     return struct.pack(f"<{len(values)}d", *values)
+
+
+def singles_of(*values: float) -> bytes:
+    return struct.pack(f"<{len(values)}f", *values)
 
 
 def raw(name: str) -> list[Any]:
@@ -515,6 +598,33 @@ SPOILED = {
     "an index beyond all reason": (put("team_report", (2, 2, 0, 1), MAX_INDEX + 1), "out_of_range"),
     "a mount of five numbers": (put("team_report", (2, 2, 2, 7), doubles(1, 2, 3, 4, 5)), "malformed"),
     "a raw measurement below the floor": (put("team_report", (2, 2, 0, 6), doubles(1e-11)), "below_sensor_floor"),
+    "a joint belief of a robot nobody knows": (put("joint_reply", (2, 1, 0), "hovercraft"), "unknown_model"),
+    "a joint belief with a target named twice": (put("joint_reply", (2, 1, 1), [["t", "unicycle"]] * 2), "malformed"),
+    "a joint belief of more than there is room for": (
+        put("joint_reply", (2, 1, 1), [[f"t{k}", "unicycle"] for k in range(MAX_JOINT_DIM // 3)]),
+        "out_of_range",
+    ),
+    "a mean of another size than robot and targets": (put("joint_reply", (2, 1, 2), doubles(1.0)), "malformed"),
+    "a joint covariance in double precision": (put("joint_reply", (2, 1, 3), doubles(*range(28))), "malformed"),
+    "a joint covariance that is indefinite": (
+        put("joint_reply", (2, 1, 3), singles_of(*(-np.eye(7))[np.triu_indices(7)])),
+        "not_positive_definite",
+    ),
+    "a joint factor of other size than said": (put("joint_request", (2, 2, 5), 4), "malformed"),
+    "a joint factor with too many columns": (put("joint_request", (2, 2, 5), MAX_JOINT_DIM + 1), "out_of_range"),
+    "a joint line as text": (put("joint_request", (2, 2, 7), "no"), "wrong_type"),
+    "noise that is not a number": (put("joint_reply", (2, 1, 8), singles_of(*[float("nan")] * 28)), "non_finite"),
+    "a prior that is enormous": (put("joint_reply", (2, 1, 9), singles_of(*[2e9] * 28)), "out_of_range"),
+    "a span that is whole": (put("joint_reply", (2, 1, 10), 2), "wrong_type"),
+    "a span before the start": (put("joint_reply", (2, 1, 10), -1.0), "out_of_range"),
+    "a span without end": (put("joint_reply", (2, 1, 10), float("inf")), "non_finite"),
+    "joint lines that are not in order": (put("joint_request", (2, 2, 11, 1, 0), [500, "r1", 3]), "malformed"),
+    "a joint line of neither size": (put("joint_request", (2, 2, 11, 0, 1), singles_of(1.0)), "malformed"),
+    "known joint factors as a number": (put("joint_reply", (2, 1, 12), 0), "wrong_type"),
+    "a joint pair anew as a number": (put("joint_reply", (2, 1, 13), 0), "wrong_type"),
+    "a joint reply to no contact": (put("joint_reply", (2, 0), [0, "", 0]), "out_of_range"),
+    "a joint request for another": (put("joint_request", (2, 0, 1), "r2"), "source_mismatch"),
+    "a joint request without measurement": (put("joint_request", (2, 1), []), "malformed"),
     "an unknown status": (put("pair_reply", (2, 1), 9), "out_of_range"),
     "a refusal with a snapshot": (put("pair_reply", (2, 1), 1), "malformed"),
     "a success without a snapshot": (put("pair_reply", (2, 2), None), "malformed"),
@@ -580,7 +690,7 @@ def test_structures_of_any_shape_raise_only_wire_errors() -> None:
     trees = st.recursive(leaves, lambda inner: st.lists(inner, max_size=8), max_leaves=30)
 
     @settings(max_examples=200, deadline=None)
-    @given(trees, st.integers(0, 6))
+    @given(trees, st.integers(0, 8))
     def check(body: Any, kind: int) -> None:
         with pytest.raises(WireError):
             decode(msgpack.packb([[1, "r1", 1, 1, 1, 1, 1], kind, [body, [], []]]), "r1")

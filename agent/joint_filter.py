@@ -1,0 +1,40 @@
+"""Cooperative localization with correlation factors of robot and targets together; see `agent.joint_factors`."""
+
+from __future__ import annotations
+
+from agent.effects import Estimate, TrackEstimate
+from agent.events import Observation
+from agent.factor_filter import FactorFilter
+from agent.factor_model import FactorModel
+from agent.joint_factors import JointFactors
+
+
+class JointFilter(FactorFilter):
+    """The form `joint`; see `agent.cooperative_filter` for what each method is given."""
+
+    def _model(self) -> FactorModel:
+        self._factors = JointFactors(self._settings, self._counters)
+        return self._factors
+
+    def estimate(self) -> Estimate:
+        state, joint = self.state, self._factors.joint
+        tracks = tuple(
+            TrackEstimate(name, model, state.mean[block], state.cov[block, block])
+            for (name, model), block in zip(joint.models, joint.blocks)
+        )
+        own = joint.own
+        return Estimate(state.t_ns, self._settings.layout.name, state.mean[own], state.cov[own, own], tracks)
+
+    def sighting(self, t_ns: int, target: str, event: Observation) -> None:
+        if target not in self._factors.joint.tracks:
+            self._counters["observation.unknown_target"] += 1
+            return
+        nis = self._use(
+            t_ns,
+            "late.target_compensated",
+            "late.target_dropped",
+            lambda then: self._factors.sighting(then, target, event),
+        )
+        if nis is not None:
+            self._counters["used.sighting"] += 1
+            self._count_nis(f"target_{event.kind}", nis)

@@ -1,0 +1,251 @@
+"""A robot's state followed by those of its targets: what a component means, how the whole moves, and what is measured.
+
+Means and covariances go in, innovations with their Jacobians come out; how errors of robots are correlated, and hence
+what gain an innovation gets, is a matter of the form of localization that uses this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.estimation.colocalization import StackedModel
+from agent.estimation.gaussian import quadratic_form, symmetrize, wrap_components
+from agent.estimation.motion import STATES, StateLayout
+from agent.estimation.observation import AbsoluteModel, RelativeModel, relative_model
+from agent.estimation.unscented import observe
+from agent.settings import AgentSettings
+from network.messages import Measurement
+
+Array = NDArray[np.float64]
+
+SAME_TARGET_M2 = 1e-4
+"""Variance by which two robots' tracks are taken to be of one target."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moved:
+    """Prediction of a joint belief: mean (n,), F (n, n), and P gains beyond F P F^T: own and target noise (n, n)."""
+
+    mean: Array
+    F: Array
+    own_noise: Array
+    target_noise: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Innovation:
+    """nu (m,) = H e + v of the joint error e (n,): H (m, n), noise of v (m, m) with residuals, S, NIS per dof.
+
+    Noise and S are inflated to the cap already, the NIS is from before that.
+    """
+
+    nu: Array
+    H: Array
+    noise: Array
+    S: Array
+    nis: float
+
+
+class JointBelief(Protocol):
+    """A robot and targets (id, model) as one belief: mean (n,), cov (n, n)."""
+
+    @property
+    def model(self) -> str: ...
+    @property
+    def targets(self) -> tuple[tuple[str, str], ...]: ...
+    @property
+    def mean(self) -> Array: ...
+    @property
+    def cov(self) -> Array: ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Met:
+    """nu (m,) = H_i e_i + H_j e_j + v of two joint errors, v of covariance R (m, m), the measurements' NIS per dof."""
+
+    nu: Array
+    H_i: Array
+    H_j: Array
+    R: Array
+    nis: float
+
+
+class JointLayout:
+    """The joint state of one robot and the targets of its settings, in their order."""
+
+    def __init__(self, settings: AgentSettings) -> None:
+        targets = settings.targets if settings.track else ()
+        localization = settings.localization
+        self._settings = settings
+        self._transform, self._parameters = localization.transform, localization.parameters
+        self._cap = localization.innovation_cap
+        self.motions = {target.id: target.motion for target in targets}
+        self.tracks = tuple(self.motions)
+        self.own = slice(0, settings.layout.dim)
+        found, begin = [], self.own.stop
+        angles = list(settings.layout.angles)
+        for target in targets:
+            layout = target.motion.layout
+            found.append(slice(begin, begin + layout.dim))
+            angles += [begin + index for index in layout.angles]
+            begin += layout.dim
+        self.blocks = tuple(found)
+        self.state = StateLayout("joint", begin, tuple(angles), settings.layout.heading, settings.layout.position)
+        self.models = tuple((name, motion.layout.name) for name, motion in self.motions.items())
+
+    def start(self) -> tuple[Array, Array]:
+        """Mean (n,) and covariance (n, n) at the start."""
+        settings = self._settings
+        targets = [target for target in settings.targets if target.id in self.motions]
+        mean = np.concatenate([settings.mean, *(target.mean for target in targets)])
+        return mean, block_diagonal([settings.cov, *(target.cov for target in targets)])
+
+    def moved(self, mean: Array, cov: Array, dt_s: float, delta: Array, delta_cov: Array) -> Moved:
+        """The robot by an odometry increment (4,), (4, 4), the targets by their models over `dt_s`."""
+        n, own = len(mean), self.own
+        after, F = np.empty(n), np.zeros((n, n))
+        own_noise, target_noise = np.zeros((n, n)), np.zeros((n, n))
+        found = self._settings.motion.advance(mean[own], cov[own, own], delta, delta_cov, dt_s, self._transform)
+        after[own], F[own, own] = found.mean, found.F
+        own_noise[own, own] = found.cov - found.F @ cov[own, own] @ found.F.T
+        for motion, block in zip(self.motions.values(), self.blocks):
+            found = motion.drift(mean[block], cov[block, block], dt_s, self._transform)
+            after[block], F[block, block] = found.mean, found.F
+            target_noise[block, block] = found.cov - found.F @ cov[block, block] @ found.F.T
+        return Moved(after, F, own_noise, target_noise)
+
+    # -- own measurements -----------------------------------------------------------------------------------
+
+    def with_target(self, target: str) -> slice | list[int]:
+        """Components of the robot and one target."""
+        block = self.blocks[self.tracks.index(target)]
+        # The first track follows the own state.
+        if block.start == self.own.stop:
+            return slice(0, block.stop)
+        return [*range(self.own.stop), *range(block.start, block.stop)]
+
+    def seen(
+        self,
+        mean: Array,
+        cov: Array,
+        part: slice | list[int],
+        model: AbsoluteModel | RelativeModel,
+        z: Array,
+        R: Array,
+        residual_factor: float,
+    ) -> Innovation:
+        """An own measurement of the components `part`; the second-order residual is charged `residual_factor` times."""
+        square = (part, part) if isinstance(part, slice) else np.ix_(part, part)
+        predicted = observe(
+            model.h,
+            model.jacobian,
+            mean[part],
+            cov[square],
+            model.angles,
+            self._transform,
+            self._parameters,
+        )
+        nu = wrap_components(z - predicted.z, model.angles)
+        noise = symmetrize(R + residual_factor * predicted.residual)
+        H = np.zeros((len(z), len(mean)))
+        H[:, part] = predicted.H
+        S = H @ cov @ H.T + noise
+        noise, S, nis = self._capped(nu, S, noise)
+        return Innovation(nu, H, noise, S, nis)
+
+    def _capped(self, nu: Array, S: Array, noise: Array) -> tuple[Array, Array, float]:
+        """Noise and S inflated until the NIS per degree of freedom is at most the cap; and the NIS before that."""
+        nis = float(quadratic_form(nu, S)) / len(nu)
+        if not 0.0 < self._cap < nis:
+            return noise, S, nis
+        more = S * (nis / self._cap - 1.0)
+        return noise + more, S + more, nis
+
+    # -- peers ----------------------------------------------------------------------------------------------
+
+    def common(self, told: JointBelief) -> list[tuple[slice, slice]]:
+        """Components of the targets that both track with the same model: (own, theirs)."""
+        mine = dict(zip(self.models, self.blocks))
+        return [(mine[target], theirs) for target, theirs in _targets(told) if target in mine]
+
+    def met(
+        self,
+        i: JointBelief,
+        j: JointBelief,
+        cross: Array | None,
+        measurements: Sequence[Measurement],
+        residual_factor: float,
+        same: bool = True,
+    ) -> Met:
+        """Relative measurements of j by i, and that the targets both track are the same ones.
+
+        cross (n_i, n_j) is P_ij, None for zero; `same` False leaves the targets out.
+        """
+        observer, subject = STATES[i.model], STATES[j.model]
+        models = [relative_model(item, observer, subject) for item in measurements]
+        model = models[0] if len(models) == 1 else StackedModel(models, [len(item.z) for item in measurements])
+        a, b = observer.dim, subject.dim
+        both = np.zeros((a + b, a + b))
+        both[:a, :a], both[a:, a:] = i.cov[:a, :a], j.cov[:b, :b]
+        if cross is not None:
+            both[:a, a:] = cross[:a, :b]
+            both[a:, :a] = cross[:a, :b].T
+        predicted = observe(
+            model.h,
+            model.jacobian,
+            np.concatenate([i.mean[:a], j.mean[:b]]),
+            both,
+            model.angles,
+            self._transform,
+            self._parameters,
+        )
+        z = np.concatenate([item.z for item in measurements])
+        m = len(z)
+        rows = [wrap_components(z - predicted.z, model.angles)]
+        theirs = dict(_targets(j))
+        shared = [(block, theirs[target], target[1]) for target, block in _targets(i) if same and target in theirs]
+        size = m + sum(block.stop - block.start for block, _, _ in shared)
+        H_i, H_j, R = np.zeros((size, len(i.mean))), np.zeros((size, len(j.mean))), np.zeros((size, size))
+        H_i[:m, :a], H_j[:m, :b] = predicted.H[:, :a], predicted.H[:, a:]
+        noise = symmetrize(block_diagonal([item.R for item in measurements]) + residual_factor * predicted.residual)
+        R[:m, :m], _, nis = self._capped(rows[0], predicted.H @ both @ predicted.H.T + noise, noise)
+        row = m
+        for mine, other, name in shared:
+            dim = mine.stop - mine.start
+            here = slice(row, row + dim)
+            H_i[here, mine], H_j[here, other] = np.eye(dim), -np.eye(dim)
+            rows.append(wrap_components(j.mean[other] - i.mean[mine], STATES[name].angles))
+            noise = SAME_TARGET_M2 * np.eye(dim)
+            S = i.cov[mine, mine] + j.cov[other, other] + noise
+            if cross is not None:
+                S = S - cross[mine, other] - cross[mine, other].T
+            R[here, here], _, _ = self._capped(rows[-1], S, noise)
+            row += dim
+        return Met(np.concatenate(rows), H_i, H_j, R, nis)
+
+
+def _targets(belief: JointBelief) -> list[tuple[tuple[str, str], slice]]:
+    """Targets (id, model) of a belief with their components."""
+    found, begin = [], STATES[belief.model].dim
+    for target in belief.targets:
+        end = begin + STATES[target[1]].dim
+        found.append((target, slice(begin, end)))
+        begin = end
+    return found
+
+
+def block_diagonal(blocks: Sequence[Array]) -> Array:
+    """Square blocks on the diagonal of a matrix."""
+    if len(blocks) == 1:
+        return blocks[0]
+    size = sum(len(block) for block in blocks)
+    found, row = np.zeros((size, size)), 0
+    for block in blocks:
+        found[row : row + len(block), row : row + len(block)] = block
+        row += len(block)
+    return found
