@@ -75,6 +75,7 @@ class JointFactors:
     def __init__(self, settings: AgentSettings, counters: Counter[str]) -> None:
         self._settings, self._counters = settings, counters
         self.joint = JointLayout(settings)
+        self.group: frozenset[str] | None = None
 
     @property
     def layout(self) -> StateLayout:
@@ -152,6 +153,7 @@ class JointFactors:
             ),
             known=record.known,
             anew=record.anew,
+            group=self.group,
         )
         if record.base.met:
             factor = state.stack.block((Part.FACTOR, peer, NEVER))
