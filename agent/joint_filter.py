@@ -14,7 +14,7 @@ class JointFilter(FactorFilter):
 
     @property
     def group(self) -> frozenset[str] | None:
-        """Robots whose errors may be correlated with the own one, and the own id, as told to peers; None: not counted."""
+        """Robots whose errors may be correlated with the own one, and the own id, as told to peers (None: nothing)."""
         return self._factors.group
 
     @group.setter

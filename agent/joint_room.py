@@ -12,7 +12,6 @@ from agent.factor_model import LONGEST
 from network.messages import MAX_GROUP, MAX_MESSAGE_BYTES, JointSnapshot, Measurement, PairRequest
 from network.wire import size_bound
 
-
 LONGEST_GROUP = frozenset(letter * 24 for letter in "abcdefgh"[:MAX_GROUP])
 
 
