@@ -63,6 +63,11 @@ class AutoFilter:
             self._why = "factors of robot and targets do not fit into a message"
 
     @property
+    def active(self) -> CooperativeFilter:
+        """The filter of the form that is on."""
+        return self._active
+
+    @property
     def t_ns(self) -> int:
         return self._active.t_ns
 

@@ -25,6 +25,9 @@ class JointFilter(FactorFilter):
         self._factors = JointFactors(self._settings, self._counters)
         return self._factors
 
+    def form(self) -> tuple[str, str]:
+        return "joint", "configured"
+
     def estimate(self) -> Estimate:
         state, joint = self.state, self._factors.joint
         tracks = tuple(
