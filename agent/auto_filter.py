@@ -154,6 +154,9 @@ class AutoFilter:
         self._lives[event.peer] = event
         self._active.link_changed(event)
 
+    def settled(self, until_ns: int, effects: list[Effect]) -> None:
+        self._active.settled(until_ns, effects)
+
     def expire(self, now_ns: int, effects: list[Effect]) -> None:
         self._active.expire(now_ns, effects)
 
