@@ -87,8 +87,16 @@ class AutoFilter:
     def form(self) -> tuple[str, str]:
         return self._active.form()[0], self._why
 
-    def absolute(self, t_ns: int, kind: str, model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> None:
-        self._active.absolute(t_ns, kind, model, z, R)
+    def absolute(
+        self,
+        t_ns: int,
+        kind: str,
+        model: AbsoluteModel | RelativeModel,
+        z: Array,
+        R: Array,
+        landmark: str | None = None,
+    ) -> None:
+        self._active.absolute(t_ns, kind, model, z, R, landmark)
 
     def sighting(self, t_ns: int, target: str, event: Observation) -> None:
         self._active.sighting(t_ns, target, event)

@@ -41,7 +41,7 @@ class Moved:
 class Innovation:
     """nu (m,) = H e + v of the joint error e (n,): H (m, n), noise of v (m, m) with residuals, S, NIS per dof.
 
-    Noise and S are inflated to the cap already, the NIS is from before that.
+    Noise and S are inflated to the cap already, the NIS is from before that. `residual` (m, m) is the second-order one.
     """
 
     nu: Array
@@ -49,6 +49,7 @@ class Innovation:
     noise: Array
     S: Array
     nis: float
+    residual: Array
 
 
 class JointBelief(Protocol):
@@ -66,13 +67,17 @@ class JointBelief(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Met:
-    """nu (m,) = H_i e_i + H_j e_j + v of two joint errors, v of covariance R (m, m), the measurements' NIS per dof."""
+    """nu (m,) = H_i e_i + H_j e_j + v of two joint errors, v of covariance R (m, m), the measurements' NIS per dof.
+
+    `residual` (m, m) is the second-order one of the measurements, zero for the rest.
+    """
 
     nu: Array
     H_i: Array
     H_j: Array
     R: Array
     nis: float
+    residual: Array
 
 
 class JointLayout:
@@ -156,7 +161,7 @@ class JointLayout:
         H[:, part] = predicted.H
         S = H @ cov @ H.T + noise
         noise, S, nis = self._capped(nu, S, noise)
-        return Innovation(nu, H, noise, S, nis)
+        return Innovation(nu, H, noise, S, nis, predicted.residual)
 
     def _capped(self, nu: Array, S: Array, noise: Array) -> tuple[Array, Array, float]:
         """Noise and S inflated until the NIS per degree of freedom is at most the cap; and the NIS before that."""
@@ -226,7 +231,9 @@ class JointLayout:
                 S = S - cross[mine, other] - cross[mine, other].T
             R[here, here], _, _ = self._capped(rows[-1], S, noise)
             row += dim
-        return Met(np.concatenate(rows), H_i, H_j, R, nis)
+        residual = np.zeros((size, size))
+        residual[:m, :m] = predicted.residual
+        return Met(np.concatenate(rows), H_i, H_j, R, nis, residual)
 
 
 def _targets(belief: JointBelief) -> list[tuple[tuple[str, str], slice]]:
