@@ -39,7 +39,7 @@ MAX_TEAM = 15
 
 class LocalizationPart(Part):
     kind: Literal["clat", "replica"] = "clat"
-    form: Literal["auto", "split_joint", "safe", "published", "joint"] = "split_joint"
+    form: Literal["auto", "split_joint", "safe", "published", "joint"] = "auto"
     transform: Literal["unscented", "linearized", "jacobian"] = "unscented"
     correlation: Literal["factors", "ignored"] = "factors"
     pair_interval_s: NotNegative | None = None

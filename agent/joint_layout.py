@@ -6,6 +6,7 @@ what gain an innovation gets, is a matter of the form of localization that uses 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -22,9 +23,6 @@ from agent.settings import AgentSettings
 from network.messages import Measurement
 
 Array = NDArray[np.float64]
-
-SAME_TARGET_M2 = 1e-4
-"""Variance by which two robots' tracks are taken to be of one target."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,11 +183,12 @@ class JointLayout:
         cross: Array | None,
         measurements: Sequence[Measurement],
         residual_factor: float,
-        same: bool = True,
+        same_m2: float,
     ) -> Met:
         """Relative measurements of j by i, and that the targets both track are the same ones.
 
-        cross (n_i, n_j) is P_ij, None for zero; `same` False leaves the targets out.
+        cross (n_i, n_j) is P_ij, None for zero. `same_m2` is the variance by which two tracks are taken to be of one
+        target; infinite, the targets are left out.
         """
         observer, subject = STATES[i.model], STATES[j.model]
         models = [relative_model(item, observer, subject) for item in measurements]
@@ -212,8 +211,8 @@ class JointLayout:
         z = np.concatenate([item.z for item in measurements])
         m = len(z)
         rows = [wrap_components(z - predicted.z, model.angles)]
-        theirs = dict(_targets(j))
-        shared = [(block, theirs[target], target[1]) for target, block in _targets(i) if same and target in theirs]
+        theirs = dict(_targets(j)) if math.isfinite(same_m2) else {}
+        shared = [(block, theirs[target], target[1]) for target, block in _targets(i) if target in theirs]
         size = m + sum(block.stop - block.start for block, _, _ in shared)
         H_i, H_j, R = np.zeros((size, len(i.mean))), np.zeros((size, len(j.mean))), np.zeros((size, size))
         H_i[:m, :a], H_j[:m, :b] = predicted.H[:, :a], predicted.H[:, a:]
@@ -225,7 +224,7 @@ class JointLayout:
             here = slice(row, row + dim)
             H_i[here, mine], H_j[here, other] = np.eye(dim), -np.eye(dim)
             rows.append(wrap_components(j.mean[other] - i.mean[mine], STATES[name].angles))
-            noise = SAME_TARGET_M2 * np.eye(dim)
+            noise = same_m2 * np.eye(dim)
             S = i.cov[mine, mine] + j.cov[other, other] + noise
             if cross is not None:
                 S = S - cross[mine, other] - cross[mine, other].T

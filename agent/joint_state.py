@@ -32,6 +32,9 @@ noise of their size is too little.
 RECURRING = 2e-3
 """Share of that residual that may be correlated with the own error in an unknown way: no repetition averages it out."""
 
+SAME_TARGET_M2 = 1e-4
+"""Variance by which two robots' tracks are taken to be of one target."""
+
 NEGLIGIBLE = 1e-2
 """Residuals below this share of a measurement's variance do not recur noticeably."""
 
@@ -155,7 +158,7 @@ class JointModel:
         """
         own = SplitSnapshot(self._settings.layout.name, self._layout.models, state.mean, state.cov)
         i, j = (own, told) if own_observed else (told, own)
-        met = self._layout.met(i, j, None, measurements, RESIDUAL_FACTOR)
+        met = self._layout.met(i, j, None, measurements, RESIDUAL_FACTOR, SAME_TARGET_M2)
         H_own, H_other = (met.H_i, met.H_j) if own_observed else (met.H_j, met.H_i)
         k = len(told.mean)
         private = told.private if trusted and told.private is not None else np.zeros((k, k))
