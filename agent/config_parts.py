@@ -39,7 +39,7 @@ MAX_TEAM = 15
 
 class LocalizationPart(Part):
     kind: Literal["clat", "replica"] = "clat"
-    form: Literal["split_joint", "safe", "published", "joint"] = "split_joint"
+    form: Literal["auto", "split_joint", "safe", "published", "joint"] = "auto"
     transform: Literal["unscented", "linearized", "jacobian"] = "unscented"
     correlation: Literal["factors", "ignored"] = "factors"
     pair_interval_s: NotNegative | None = None
@@ -58,7 +58,7 @@ class LocalizationPart(Part):
             return LocalizationSettings(
                 kind="replica", transform=self.transform, innovation_cap=self.innovation_cap or 0.0
             )
-        joint = self.form in ("split_joint", "joint")
+        joint = self.form in ("auto", "split_joint", "joint")
         if self.correlation == "ignored" and joint:
             raise ConfigError(
                 "correlation = 'ignored' is a baseline of two forms only; add form = 'published' or 'safe'"

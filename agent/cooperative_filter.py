@@ -11,12 +11,17 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.effects import Effect, Estimate
+from agent.effects import Effect, Estimate, Send
 from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.events import LinkChange, Observation, Received
-from network.messages import Body, Epoch, Measurement
+from network.messages import Body, Epoch, Measurement, PairReply, ReplyStatus
 
 Array = NDArray[np.float64]
+
+
+def refusal(peer: str, epoch: Epoch) -> Send:
+    """The answer to a request of a form that is not the own one."""
+    return Send(peer, epoch.t_meas_ns, PairReply(epoch, ReplyStatus.OTHER_FORM))
 
 
 class CooperativeFilter(Protocol):

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.belief import RobotState, TargetState
+from agent.cooperative_filter import refusal
 from agent.effects import Effect, Estimate, Send, TrackEstimate
 from agent.estimation.colocalization import Options, Update, sighting_update
 from agent.estimation.observation import AbsoluteModel, RelativeModel, relative_model
@@ -188,6 +189,8 @@ class FactorFilter:
         body = event.message.body
         if not isinstance(body, PairRequest) or not isinstance(body.snapshot, self.model.snapshot_type):
             self._counters["pair.other_form"] += 1
+            if isinstance(body, PairRequest):
+                effects.append(refusal(event.message.header.source, body.epoch))
             return
         self.state = self._pairs.request(event, t_ns, self.state, self.history, effects)
 

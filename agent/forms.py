@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 
+from agent.auto_filter import AutoFilter
 from agent.cooperative_filter import CooperativeFilter
 from agent.factor_filter import FactorFilter
 from agent.joint_filter import JointFilter
@@ -21,6 +22,8 @@ def build_filter(
         return ReplicaFilter(settings, counters, count_nis)
     if settings.localization.form == "split_joint":
         return SplitFilter(settings, counters, count_nis)
+    if settings.localization.form == "auto":
+        return AutoFilter(settings, counters, count_nis)
     if settings.localization.form == "joint":
         return JointFilter(settings, counters, count_nis)
     return FactorFilter(settings, counters, count_nis)

@@ -12,9 +12,21 @@ from agent.joint_factors import JointFactors
 class JointFilter(FactorFilter):
     """The form `joint`; see `agent.cooperative_filter` for what each method is given."""
 
+    @property
+    def group(self) -> frozenset[str] | None:
+        """Robots whose errors may be correlated with the own one, and the own id, as told to peers (None: nothing)."""
+        return self._factors.group
+
+    @group.setter
+    def group(self, group: frozenset[str]) -> None:
+        self._factors.group = group
+
     def _model(self) -> FactorModel:
         self._factors = JointFactors(self._settings, self._counters)
         return self._factors
+
+    def form(self) -> tuple[str, str]:
+        return "joint", "configured"
 
     def estimate(self) -> Estimate:
         state, joint = self.state, self._factors.joint

@@ -6,6 +6,7 @@ what gain an innovation gets, is a matter of the form of localization that uses 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -23,9 +24,6 @@ from network.messages import Measurement
 
 Array = NDArray[np.float64]
 
-SAME_TARGET_M2 = 1e-4
-"""Variance by which two robots' tracks are taken to be of one target."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moved:
@@ -41,7 +39,7 @@ class Moved:
 class Innovation:
     """nu (m,) = H e + v of the joint error e (n,): H (m, n), noise of v (m, m) with residuals, S, NIS per dof.
 
-    Noise and S are inflated to the cap already, the NIS is from before that.
+    Noise and S are inflated to the cap already, the NIS is from before that. `residual` (m, m) is the second-order one.
     """
 
     nu: Array
@@ -49,6 +47,7 @@ class Innovation:
     noise: Array
     S: Array
     nis: float
+    residual: Array
 
 
 class JointBelief(Protocol):
@@ -66,13 +65,17 @@ class JointBelief(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Met:
-    """nu (m,) = H_i e_i + H_j e_j + v of two joint errors, v of covariance R (m, m), the measurements' NIS per dof."""
+    """nu (m,) = H_i e_i + H_j e_j + v of two joint errors, v of covariance R (m, m), the measurements' NIS per dof.
+
+    `residual` (m, m) is the second-order one of the measurements, zero for the rest.
+    """
 
     nu: Array
     H_i: Array
     H_j: Array
     R: Array
     nis: float
+    residual: Array
 
 
 class JointLayout:
@@ -156,7 +159,7 @@ class JointLayout:
         H[:, part] = predicted.H
         S = H @ cov @ H.T + noise
         noise, S, nis = self._capped(nu, S, noise)
-        return Innovation(nu, H, noise, S, nis)
+        return Innovation(nu, H, noise, S, nis, predicted.residual)
 
     def _capped(self, nu: Array, S: Array, noise: Array) -> tuple[Array, Array, float]:
         """Noise and S inflated until the NIS per degree of freedom is at most the cap; and the NIS before that."""
@@ -180,11 +183,12 @@ class JointLayout:
         cross: Array | None,
         measurements: Sequence[Measurement],
         residual_factor: float,
-        same: bool = True,
+        same_m2: float,
     ) -> Met:
         """Relative measurements of j by i, and that the targets both track are the same ones.
 
-        cross (n_i, n_j) is P_ij, None for zero; `same` False leaves the targets out.
+        cross (n_i, n_j) is P_ij, None for zero. `same_m2` is the variance by which two tracks are taken to be of one
+        target; infinite, the targets are left out.
         """
         observer, subject = STATES[i.model], STATES[j.model]
         models = [relative_model(item, observer, subject) for item in measurements]
@@ -207,8 +211,8 @@ class JointLayout:
         z = np.concatenate([item.z for item in measurements])
         m = len(z)
         rows = [wrap_components(z - predicted.z, model.angles)]
-        theirs = dict(_targets(j))
-        shared = [(block, theirs[target], target[1]) for target, block in _targets(i) if same and target in theirs]
+        theirs = dict(_targets(j)) if math.isfinite(same_m2) else {}
+        shared = [(block, theirs[target], target[1]) for target, block in _targets(i) if target in theirs]
         size = m + sum(block.stop - block.start for block, _, _ in shared)
         H_i, H_j, R = np.zeros((size, len(i.mean))), np.zeros((size, len(j.mean))), np.zeros((size, size))
         H_i[:m, :a], H_j[:m, :b] = predicted.H[:, :a], predicted.H[:, a:]
@@ -220,13 +224,15 @@ class JointLayout:
             here = slice(row, row + dim)
             H_i[here, mine], H_j[here, other] = np.eye(dim), -np.eye(dim)
             rows.append(wrap_components(j.mean[other] - i.mean[mine], STATES[name].angles))
-            noise = SAME_TARGET_M2 * np.eye(dim)
+            noise = same_m2 * np.eye(dim)
             S = i.cov[mine, mine] + j.cov[other, other] + noise
             if cross is not None:
                 S = S - cross[mine, other] - cross[mine, other].T
             R[here, here], _, _ = self._capped(rows[-1], S, noise)
             row += dim
-        return Met(np.concatenate(rows), H_i, H_j, R, nis)
+        residual = np.zeros((size, size))
+        residual[:m, :m] = predicted.residual
+        return Met(np.concatenate(rows), H_i, H_j, R, nis, residual)
 
 
 def _targets(belief: JointBelief) -> list[tuple[tuple[str, str], slice]]:

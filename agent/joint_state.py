@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import is_positive_definite, wrap_components
+from agent.estimation.gaussian import is_positive_definite, symmetrize, wrap_components
 from agent.estimation.observation import AbsoluteModel, RelativeModel
-from agent.estimation.split_joint import Split, update_from_peer, update_own
+from agent.estimation.split_joint import Split, SplitUpdate, update_from_peer, update_own, update_own_recurring
 from agent.joint_layout import JointLayout
 from agent.settings import AgentSettings
 from network.messages import Measurement, SplitSnapshot
@@ -28,6 +28,15 @@ RESIDUAL_FACTOR = 6.0
 Where both ends are uncertain, errors of linearization recur with the same sign as long as the geometry stays; white
 noise of their size is too little.
 """
+
+RECURRING = 2e-3
+"""Share of that residual that may be correlated with the own error in an unknown way: no repetition averages it out."""
+
+SAME_TARGET_M2 = 1e-4
+"""Variance by which two robots' tracks are taken to be of one target."""
+
+NEGLIGIBLE = 1e-2
+"""Residuals below this share of a measurement's variance do not recur noticeably."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +109,13 @@ class JointModel:
         residual_factor: float,
     ) -> Used:
         seen = self._layout.seen(state.mean, state.cov, part, model, z, R, residual_factor)
-        update = update_own(state.split, seen.H, seen.noise)
+        update: SplitUpdate | None
+        if residual_factor > 1.0 and seen.residual.trace() > NEGLIGIBLE * R.trace():
+            update = update_own_recurring(state.split, seen.H, seen.noise, RECURRING * symmetrize(seen.residual))
+            if update is None:
+                return Used(state, seen.nis)
+        else:
+            update = update_own(state.split, seen.H, seen.noise)
         return Used(self._shifted(state, update.K @ seen.nu, update.split), seen.nis)
 
     def _shifted(self, state: JointState, correction: Array, split: Split) -> JointState:
@@ -143,11 +158,12 @@ class JointModel:
         """
         own = SplitSnapshot(self._settings.layout.name, self._layout.models, state.mean, state.cov)
         i, j = (own, told) if own_observed else (told, own)
-        met = self._layout.met(i, j, None, measurements, RESIDUAL_FACTOR)
+        met = self._layout.met(i, j, None, measurements, RESIDUAL_FACTOR, SAME_TARGET_M2)
         H_own, H_other = (met.H_i, met.H_j) if own_observed else (met.H_j, met.H_i)
         k = len(told.mean)
         private = told.private if trusted and told.private is not None else np.zeros((k, k))
-        update = update_from_peer(state.split, Split(private, told.cov - private), H_own, H_other, met.R)
+        other, recurring = Split(private, told.cov - private), RECURRING * symmetrize(met.residual)
+        update = update_from_peer(state.split, other, H_own, H_other, met.R, recurring)
         if update is None:
             return Used(state, met.nis)
         return Used(self._shifted(state, update.K @ met.nu, update.split), met.nis)

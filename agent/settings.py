@@ -34,7 +34,7 @@ class LocalizationSettings:
     """
 
     kind: Literal["clat", "replica"] = "clat"
-    form: Literal["split_joint", "safe", "published", "joint"] = "split_joint"
+    form: Literal["auto", "split_joint", "safe", "published", "joint"] = "auto"
     transform: Transform = "unscented"
     correlation: Literal["factors", "ignored"] = "factors"
     sighting_weight: Weight = "trace"

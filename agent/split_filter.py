@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.cooperative_filter import refusal
 from agent.effects import Effect, Estimate, Send, TrackEstimate
 from agent.estimation.motion import STATES
 from agent.estimation.observation import (
@@ -51,11 +52,16 @@ class SplitFilter:
     """The form `split_joint`; see `agent.cooperative_filter` for what each method is given."""
 
     def __init__(
-        self, settings: AgentSettings, counters: Counter[str], count_nis: Callable[[str, float], None]
+        self,
+        settings: AgentSettings,
+        counters: Counter[str],
+        count_nis: Callable[[str, float], None],
+        start: JointState | None = None,
     ) -> None:
+        """`start`: the first state, by default that of the settings."""
         self._settings, self._counters, self._count_nis = settings, counters, count_nis
         self._model = JointModel(settings)
-        self.history = JointHistory(self._model, settings.lateness, self._model.initial(), counters)
+        self.history = JointHistory(self._model, settings.lateness, start or self._model.initial(), counters)
         self._motions = {target.id: target.motion for target in settings.targets}
         self._clocks = PairClocks(settings)
         self._exchanges: dict[str, SplitExchange] = {}
@@ -93,6 +99,10 @@ class SplitFilter:
 
     def contacts(self) -> dict[str, Epoch]:
         return dict(self._contacts)
+
+    def take_over(self, contacts: dict[str, Epoch]) -> None:
+        """Count the contacts another form has used, by peer, as the last ones."""
+        self._contacts.update(contacts)
 
     def form(self) -> tuple[str, str]:
         return "split_joint", "configured"
@@ -211,6 +221,8 @@ class SplitFilter:
         peer, request = event.message.header.source, event.message.body
         if not isinstance(request, SplitRequest):
             self._counters["pair.other_form"] += 1
+            if isinstance(request, PairRequest):
+                effects.append(refusal(peer, request.epoch))
             return
         if not _usable(request.snapshot) or any(item.kind not in RELATIVE_ANGLES for item in request.measurements):
             self._counters["pair.malformed"] += 1

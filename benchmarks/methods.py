@@ -37,7 +37,7 @@ REGIMES = (
     Regime("dense-10", "10 robots in constant contact, no fix", 10),
     Regime("dense-10-anchored", "the same, robot 1 has fixes", 10),
 )
-FORMS = ("split_joint", "safe", "published", "joint")
+FORMS = ("auto", "split_joint", "joint", "safe", "published")
 METHODS = (*FORMS, "replica")
 """Forms of kind `clat`, and the kind that has none."""
 

@@ -27,6 +27,9 @@ MAX_STATE_DIM = 8
 MAX_JOINT_DIM = 16
 """Components of a robot and its targets together in one belief."""
 
+MAX_GROUP = 3
+"""Robots whose correlation factors are exact enough; a belief with factors is told of no more."""
+
 MAX_TARGETS = 8
 MAX_MEASUREMENTS = 8
 MAX_ECHOES = 16
@@ -165,6 +168,8 @@ class JointSnapshot:
     lines   later contacts the sender opened and does not know the fate of, oldest first
     known   as in `Snapshot`
     anew    the pair began again from zero correlation: prior and noise from before do not count
+    group   robots whose errors may be correlated with the sender's through any chain of contacts, and the sender; None
+            if the sender does not count them
     """
 
     model: str
@@ -180,6 +185,7 @@ class JointSnapshot:
     lines: tuple[Line, ...] = ()
     known: bool = True
     anew: bool = False
+    group: frozenset[str] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,6 +209,7 @@ class ReplyStatus(IntEnum):
     TOO_OLD = 1
     BUSY = 2
     SUPERSEDED = 3
+    OTHER_FORM = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,6 +18,7 @@ import numpy as np
 
 from network.messages import (
     MAX_ECHOES,
+    MAX_GROUP,
     MAX_JOINT_DIM,
     MAX_LINES,
     MAX_MEASUREMENTS,
@@ -200,6 +201,7 @@ def _pack_joint(snapshot: JointSnapshot) -> tuple[Any, ...]:
         tuple((pack_epoch(line.epoch), pack_single(line.matrix, line.matrix.shape)) for line in snapshot.lines),
         snapshot.known,
         snapshot.anew,
+        None if snapshot.group is None else tuple(sorted(snapshot.group)),
     )
 
 
@@ -370,8 +372,9 @@ def _split(raw: Any) -> SplitSnapshot:
 
 
 def _joint(raw: Any) -> JointSnapshot:
-    fields = read_fields(raw, 14)
-    model, targets_raw, mean, cov, base, columns, factor, line, noise, prior, span_s, lines_raw, known, anew = fields
+    fields = read_fields(raw, 15)
+    model, targets_raw, mean, cov, base, columns, factor, line, noise, prior, span_s = fields[:11]
+    lines_raw, known, anew, group = fields[11:]
     targets, n, c = _robot_and_targets(model, targets_raw)
     m = read_integer(columns, MAX_JOINT_DIM)
     if type(known) is not bool or type(anew) is not bool or type(span_s) is not float:
@@ -400,7 +403,15 @@ def _joint(raw: Any) -> JointSnapshot:
         lines=tuple(lines),
         known=known,
         anew=anew,
+        group=None if group is None else _group(group),
     )
+
+
+def _group(raw: Any) -> frozenset[str]:
+    names = [read_id(item) for item in read_items(raw, MAX_GROUP)]
+    if any(later <= earlier for earlier, later in pairwise(names)):
+        raise WireError("malformed")
+    return frozenset(names)
 
 
 def _split_request(raw: Any, header: Header) -> SplitRequest:

@@ -83,17 +83,31 @@ def _factors(own: float, other: float) -> Array:
     return np.array(found)
 
 
-def update_from_peer(own: Split, other: Split, H_own: Array, H_other: Array, R: Array) -> SplitUpdate | None:
+def update_own_recurring(split: Split, H: Array, R: Array, recurring: Array) -> SplitUpdate | None:
+    """`update_own` where noise of covariance `recurring` (m, m) comes with R, and may be correlated with the own error.
+
+    All of the covariance is shared afterwards. None if the belief is better left alone.
+    """
+    nobody = Split(np.zeros((0, 0)), np.zeros((0, 0)))
+    return update_from_peer(split.told(), nobody, H, np.zeros((len(H), 0)), R, recurring)
+
+
+def update_from_peer(
+    own: Split, other: Split, H_own: Array, H_other: Array, R: Array, recurring: Array | None = None
+) -> SplitUpdate | None:
     """Use an innovation nu = H_own e_own + H_other e_other + v of two beliefs, for the own one only.
 
     own (n, n), other (k, k), H_own (m, n), H_other (m, k), R (m, m) positive definite. The own private noise up to now
     and the measurement noise are shared afterwards, since the peer may use the same innovation. None if no gain
-    lowers the trace of P relative to the prior: the belief is better left alone.
+    lowers the trace of P relative to the prior: the belief is better left alone. `recurring` (m, m): covariance of a
+    part of v that comes on top of R and may be correlated with the own error in any way, but not with the other's.
     """
     n = len(own.private)
     C_private, C_shared = own.private @ H_own.T, own.shared @ H_own.T
     own_private, own_shared = H_own @ C_private, symmetrize(H_own @ C_shared)
     other_shared = symmetrize(H_other @ other.shared @ H_other.T)
+    if recurring is not None:
+        other_shared = other_shared + recurring
     foreign = H_other @ other.private @ H_other.T + R
     independent = symmetrize(own_private + foreign)
     metric = inverse(own.cov)

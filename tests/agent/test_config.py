@@ -90,11 +90,12 @@ def test_without_tracking_no_target_is_tracked() -> None:
 
 
 def test_the_forms_stand_for_their_parts() -> None:
-    split, safe, published, joint = (
-        LocalizationPart(form=form).settings() for form in ("split_joint", "safe", "published", "joint")
+    auto, split, safe, published, joint = (
+        LocalizationPart(form=form).settings() for form in ("auto", "split_joint", "safe", "published", "joint")
     )
+    assert (auto.pair_interval_ns, auto.innovation_cap) == (0, 9.0)
     assert (joint.pair_interval_ns, joint.innovation_cap) == (0, 9.0)
-    assert LocalizationPart().settings() == split
+    assert LocalizationPart().settings() == auto
     assert (split.pair_interval_ns, split.innovation_cap) == (0, 9.0)
     assert (safe.innovation_cap, published.innovation_cap) == (0.0, 0.0)
     assert LocalizationPart(innovation_cap=0.0).settings().innovation_cap == 0.0

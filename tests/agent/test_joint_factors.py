@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import cycle, product
 
@@ -12,6 +13,7 @@ from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
 
+import agent.joint_factors
 from agent.belief import Part
 from agent.core import Agent
 from agent.effects import Send
@@ -79,6 +81,14 @@ def excess(acts: tuple[Act, ...], fates: tuple[str, ...], steps: int, drive: flo
     story = Story(acts, fates, steps, {}, drive)
     difference = story.claimed() - true_covariance(acts, fates, steps, drive)
     return story, difference[np.ix_(BOTH, BOTH)]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _the_same_target() -> Iterator[None]:
+    """What is claimed can be compared with the truth where the targets are taken for the same, as they are."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(agent.joint_factors, "SAME_TARGET_M2", 1e-4)
+        yield
 
 
 # -- what is claimed -----------------------------------------------------------------------------------------

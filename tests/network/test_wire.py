@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from network.messages import (
     MAX_ECHOES,
+    MAX_GROUP,
     MAX_JOINT_DIM,
     MAX_LINES,
     MAX_MESSAGE_BYTES,
@@ -125,7 +126,14 @@ def example_joint(met: bool = True) -> JointSnapshot:
         base=Epoch(400, "r2", 3) if met else NEVER,
     )
     if not met:
-        return dataclasses.replace(found, noise=np.eye(7, 4) / 2, prior=np.eye(7, 4, -3), span_s=2.5, known=False)
+        return dataclasses.replace(
+            found,
+            noise=np.eye(7, 4) / 2,
+            prior=np.eye(7, 4, -3),
+            span_s=2.5,
+            known=False,
+            group=frozenset(("r1", "r2")),
+        )
     lines = (Line(Epoch(500, "r1", 4), 0.5 * np.eye(7)), Line(Epoch(600, "r1", 5), np.eye(7, 11) / 4))
     factor = np.arange(21.0).reshape(7, 3) / 16
     return dataclasses.replace(found, factor=factor, line=np.eye(7) + 0.125, lines=lines, anew=True)
@@ -255,6 +263,7 @@ def joint_snapshots(draw: st.DrawFn) -> JointSnapshot:
         lines=tuple(Line(epoch, draw(singles(n, n + draw(st.sampled_from([0, c]))))) for epoch in line_epochs),
         known=draw(st.booleans()),
         anew=draw(st.booleans()),
+        group=draw(st.one_of(st.none(), st.frozensets(ids, max_size=MAX_GROUP))),
     )
 
 
@@ -622,6 +631,10 @@ SPOILED = {
     "a joint line of neither size": (put("joint_request", (2, 2, 11, 0, 1), singles_of(1.0)), "malformed"),
     "known joint factors as a number": (put("joint_reply", (2, 1, 12), 0), "wrong_type"),
     "a joint pair anew as a number": (put("joint_reply", (2, 1, 13), 0), "wrong_type"),
+    "a group out of order": (put("joint_reply", (2, 1, 14), ["r2", "r1"]), "malformed"),
+    "a group too large for factors": (put("joint_reply", (2, 1, 14), ["r1", "r2", "r3", "r4"]), "out_of_range"),
+    "a group of somebody without a name": (put("joint_reply", (2, 1, 14), [""]), "bad_id"),
+    "a group that is a name": (put("joint_reply", (2, 1, 14), "r1"), "wrong_type"),
     "a joint reply to no contact": (put("joint_reply", (2, 0), [0, "", 0]), "out_of_range"),
     "a joint request for another": (put("joint_request", (2, 0, 1), "r2"), "source_mismatch"),
     "a joint request without measurement": (put("joint_request", (2, 1), []), "malformed"),

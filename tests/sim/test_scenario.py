@@ -88,7 +88,7 @@ def test_a_robot_may_localize_in_its_own_way() -> None:
     scenario = load("ut-clat", ["robots.r2.localization.form=published", "localization.pair_timeout_s=7"])
     assert scenario.localization_of(robot(scenario, "r2")).form == "published"
     assert scenario.localization_of(robot(scenario, "r2")).pair_timeout_s == 7.0
-    assert scenario.localization_of(robot(scenario, "r1")).form == "split_joint"
+    assert scenario.localization_of(robot(scenario, "r1")).form == "auto"
     assert scenario.localization_of(robot(scenario, "r2")).settings().pair_interval_ns == 0
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.estimation.split_joint import Split, update_from_peer, update_own
+from agent.estimation.split_joint import Split, update_from_peer, update_own, update_own_recurring
 
 
 def random_psd(rng: np.random.Generator, n: int, rank: int) -> np.ndarray:
@@ -47,6 +47,30 @@ def test_the_bound_holds_for_every_correlation_of_the_shared_errors(seed: int, n
     )
     gap = np.linalg.eigvalsh(found.split.cov - truth)
     assert gap.min() > -1e-8 * max(1.0, np.abs(truth).max()), seed
+
+
+@given(st.integers(0, 10_000), st.integers(2, 6), st.integers(1, 3))
+def test_the_bound_holds_for_noise_that_recurs_with_the_own_error(seed: int, n: int, m: int) -> None:
+    rng = np.random.default_rng(seed)
+    own, H, R = random_split(rng, n), rng.normal(size=(m, n)), random_psd(rng, m, m) + 1e-2 * np.eye(m)
+    recurring = random_psd(rng, m, m) + 1e-3 * np.eye(m)
+    found = update_own_recurring(own, H, R, recurring)
+    if found is None:
+        return
+    cross = correlated(rng, own.cov, recurring)
+    left, K = np.eye(n) - found.K @ H, found.K
+    truth = left @ own.cov @ left.T + K @ (R + recurring) @ K.T - left @ cross @ K.T - K @ cross.T @ left.T
+    gap = np.linalg.eigvalsh(found.split.cov - truth)
+    assert gap.min() > -1e-8 * max(1.0, np.abs(truth).max()), seed
+
+
+def test_noise_that_recurs_is_never_averaged_out() -> None:
+    """However often a range with such an error is repeated, its variance stays in the estimate."""
+    split, H, R = Split(np.eye(1), np.zeros((1, 1))), np.eye(1), np.array([[0.01]])
+    for _ in range(200):
+        found = update_own_recurring(split, H, R, np.array([[0.2]]))
+        split = split if found is None else found.split
+    assert split.cov[0, 0] > 0.2
 
 
 def test_the_bound_is_put_to_the_test() -> None:

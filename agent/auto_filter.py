@@ -1,0 +1,172 @@
+"""The form `auto`: correlation factors while so few robots have met that they are exact, no factors beyond that.
+
+Factors of a pair cannot know what a third robot's contacts did to the correlation. Among three robots little is missed
+and the form `joint` is honest and the more accurate one; among more it claims too much, and `split_joint` takes over,
+for good. What counts is the group: the robots whose errors may be correlated with the own one through any chain of
+contacts. It travels with every belief of the form `joint`.
+
+Hand-over: the joint belief of robot and targets stays as it is, and all of its covariance counts as shared, correlated
+with every other robot's in an unknown way. So nothing is counted twice, whatever the peers know of it. Instants before
+the hand-over cannot be returned to. A robot that has handed over refuses requests of the form `joint`; the refusal, and
+its own requests, make its peers hand over too.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.cooperative_filter import CooperativeFilter
+from agent.effects import Effect, Estimate
+from agent.estimation.observation import AbsoluteModel, RelativeModel
+from agent.estimation.split_joint import Split
+from agent.events import LinkChange, Observation, Received
+from agent.joint_filter import JointFilter
+from agent.joint_room import has_room
+from agent.joint_state import JointState
+from agent.settings import AgentSettings
+from agent.split_filter import SplitFilter
+from network.messages import (
+    MAX_GROUP,
+    Body,
+    Epoch,
+    JointSnapshot,
+    Measurement,
+    PairReply,
+    PairRequest,
+    ReplyStatus,
+    SplitRequest,
+)
+
+Array = NDArray[np.float64]
+CountNis = Callable[[str, float], None]
+
+
+class AutoFilter:
+    """The form `auto`; see `agent.cooperative_filter` for what each method is given."""
+
+    def __init__(self, settings: AgentSettings, counters: Counter[str], count_nis: CountNis) -> None:
+        self._settings, self._counters, self._count_nis = settings, counters, count_nis
+        self._joint: JointFilter | None = None
+        self._active: CooperativeFilter
+        self._lives: dict[str, LinkChange] = {}
+        followed = [(target.id, target.motion.layout) for target in settings.targets] if settings.track else []
+        if has_room(settings.layout, followed):
+            self._active = self._joint = JointFilter(settings, counters, count_nis)
+            self._joint.group = frozenset((settings.robot,))
+            self._why = f"at most {MAX_GROUP} robots have met"
+        else:
+            self._active = SplitFilter(settings, counters, count_nis)
+            self._why = "factors of robot and targets do not fit into a message"
+
+    @property
+    def active(self) -> CooperativeFilter:
+        """The filter of the form that is on."""
+        return self._active
+
+    @property
+    def t_ns(self) -> int:
+        return self._active.t_ns
+
+    @property
+    def revision(self) -> object:
+        return self._active.revision
+
+    def advance(self, t_ns: int, delta: Array, cov: Array) -> None:
+        self._active.advance(t_ns, delta, cov)
+
+    def estimate(self) -> Estimate:
+        return self._active.estimate()
+
+    def contacts(self) -> dict[str, Epoch]:
+        return self._active.contacts()
+
+    def form(self) -> tuple[str, str]:
+        return self._active.form()[0], self._why
+
+    def absolute(
+        self,
+        t_ns: int,
+        kind: str,
+        model: AbsoluteModel | RelativeModel,
+        z: Array,
+        R: Array,
+        landmark: str | None = None,
+    ) -> None:
+        self._active.absolute(t_ns, kind, model, z, R, landmark)
+
+    def sighting(self, t_ns: int, target: str, event: Observation) -> None:
+        self._active.sighting(t_ns, target, event)
+
+    # -- which form is on -----------------------------------------------------------------------------------
+
+    def _meets(self, others: frozenset[str] | None) -> None:
+        """Errors of `others` are about to become correlated with the own one: hand over if they are too many."""
+        if self._joint is None:
+            return
+        if others is None or self._joint.group is None:
+            self._hand_over("a peer does not count whom it has met")
+            return
+        group = self._joint.group | others
+        if len(group) > MAX_GROUP:
+            self._hand_over(f"errors of {', '.join(sorted(group))} would be correlated")
+        else:
+            self._joint.group = group
+
+    def _hand_over(self, why: str) -> None:
+        assert self._joint is not None
+        joint, state = self._joint, self._joint.state
+        tracks = tuple(track.target for track in joint.estimate().tracks)
+        start = JointState(state.t_ns, state.mean, Split(np.zeros_like(state.cov), state.cov), tracks)
+        split = SplitFilter(self._settings, self._counters, self._count_nis, start)
+        split.take_over(joint.contacts())
+        for event in self._lives.values():
+            split.link_changed(event)
+        self._joint, self._active, self._why = None, split, why
+        self._counters["form.handed_over"] += 1
+
+    # -- peers ----------------------------------------------------------------------------------------------
+
+    def measured(
+        self, peer: str, t_ns: int, now_ns: int, measurements: tuple[Measurement, ...], effects: list[Effect]
+    ) -> None:
+        self._meets(frozenset((peer,)))
+        self._active.measured(peer, t_ns, now_ns, measurements, effects)
+
+    def instant_ns(self, event: Received) -> int:
+        return self._active.instant_ns(event)
+
+    def requested(self, event: Received, t_ns: int, effects: list[Effect]) -> None:
+        peer, body = event.message.header.source, event.message.body
+        if self._joint is not None and isinstance(body, SplitRequest):
+            self._hand_over(f"{peer} keeps no factors")
+        elif isinstance(body, PairRequest) and isinstance(body.snapshot, JointSnapshot):
+            self._meets(body.snapshot.group)
+        self._active.requested(event, t_ns, effects)
+
+    def replied(self, peer: str, body: Body) -> None:
+        if self._joint is not None and isinstance(body, PairReply):
+            if body.status is ReplyStatus.OTHER_FORM:
+                self._hand_over(f"{peer} keeps no factors")
+            elif isinstance(body.snapshot, JointSnapshot):
+                self._meets(body.snapshot.group)
+        self._active.replied(peer, body)
+
+    def heard(self, event: Received, effects: list[Effect]) -> None:
+        self._active.heard(event, effects)
+
+    def link_changed(self, event: LinkChange) -> None:
+        self._lives[event.peer] = event
+        self._active.link_changed(event)
+
+    def settled(self, until_ns: int, effects: list[Effect]) -> None:
+        self._active.settled(until_ns, effects)
+
+    def expire(self, now_ns: int, effects: list[Effect]) -> None:
+        self._active.expire(now_ns, effects)
+
+    def deadline_ns(self) -> int:
+        return self._active.deadline_ns()
