@@ -3,7 +3,8 @@
 Factors of a pair cannot know what a third robot's contacts did to the correlation. Among three robots little is missed
 and the form `joint` is honest and the more accurate one; among more it claims too much, and `split_joint` takes over,
 for good. What counts is the group: the robots whose errors may be correlated with the own one through any chain of
-contacts. It travels with every belief of the form `joint`.
+contacts. It travels with every belief of the form `joint`. Measurements far from linear, ranges of a robot that hardly
+knows where it is for instance, make factors overconfident in any group, and are a reason to hand over as well.
 
 Hand-over: the joint belief of robot and targets stays as it is, and all of its covariance counts as shared, correlated
 with every other robot's in an unknown way. So nothing is counted twice, whatever the peers know of it. Instants before
@@ -43,6 +44,13 @@ from network.messages import (
 
 Array = NDArray[np.float64]
 CountNis = Callable[[str, float], None]
+
+MAX_NONLINEARITY = 3.0
+"""Measurements whose second-order residual is as large as their noise, in number, after which factors are given up.
+
+Such errors recur, and every chain of contacts brings them back as if they were new information. One or two happen to
+anybody who starts far from the truth; where they matter there are dozens.
+"""
 
 
 class AutoFilter:
@@ -100,6 +108,7 @@ class AutoFilter:
 
     def sighting(self, t_ns: int, target: str, event: Observation) -> None:
         self._active.sighting(t_ns, target, event)
+        self._check_linearity()
 
     # -- which form is on -----------------------------------------------------------------------------------
 
@@ -115,6 +124,10 @@ class AutoFilter:
             self._hand_over(f"errors of {', '.join(sorted(group))} would be correlated")
         else:
             self._joint.group = group
+
+    def _check_linearity(self) -> None:
+        if self._joint is not None and self._joint.nonlinearity > MAX_NONLINEARITY:
+            self._hand_over("measurements keep being far from linear")
 
     def _hand_over(self, why: str) -> None:
         assert self._joint is not None
@@ -146,6 +159,7 @@ class AutoFilter:
         elif isinstance(body, PairRequest) and isinstance(body.snapshot, JointSnapshot):
             self._meets(body.snapshot.group)
         self._active.requested(event, t_ns, effects)
+        self._check_linearity()
 
     def replied(self, peer: str, body: Body) -> None:
         if self._joint is not None and isinstance(body, PairReply):
@@ -154,6 +168,7 @@ class AutoFilter:
             elif isinstance(body.snapshot, JointSnapshot):
                 self._meets(body.snapshot.group)
         self._active.replied(peer, body)
+        self._check_linearity()
 
     def heard(self, event: Received, effects: list[Effect]) -> None:
         self._active.heard(event, effects)

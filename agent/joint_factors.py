@@ -82,6 +82,9 @@ class JointFactors:
         self._settings, self._counters = settings, counters
         self.joint = JointLayout(settings)
         self.group: frozenset[str] | None = None
+        self.nonlinearity = 0.0
+        """Second-order residuals of all measurements of robots and targets so far, as shares of their variances, each of one
+        at most."""
 
     @property
     def layout(self) -> StateLayout:
@@ -139,8 +142,13 @@ class JointFactors:
         residual_factor: float,
     ) -> Update | None:
         seen = self.joint.seen(state.mean, state.cov, part, model, z, R, residual_factor)
+        if residual_factor > 1.0:
+            self._note_nonlinearity(seen.residual, R)
         K = gain(state.cov @ seen.H.T, seen.S)
         return applied(state.mean, state.cov, self.layout, K, seen.S, seen.nu, seen.nis, seen.H)
+
+    def _note_nonlinearity(self, residual: Array, R: Array) -> None:
+        self.nonlinearity += min(float(np.max(residual.diagonal() / R.diagonal())), 1.0)
 
     # -- what is told ---------------------------------------------------------------------------------------
 
@@ -252,6 +260,8 @@ class JointFactors:
             self._counters["pair.targets_unused"] += 1
         same_m2 = SAME_TARGET_M2 if complete else np.inf
         met = self.joint.met(initiator, responder, cross, measurements, RESIDUAL_FACTOR, same_m2)
+        m = sum(len(item.z) for item in measurements)
+        self._note_nonlinearity(met.residual[:m, :m], block_diagonal([item.R for item in measurements]))
         C_i = P_i @ met.H_i.T + cross @ met.H_j.T
         C_j = cross.T @ met.H_i.T + P_j @ met.H_j.T
         S = symmetrize(met.H_i @ C_i + met.H_j @ C_j + met.R)

@@ -21,6 +21,11 @@ class JointFilter(FactorFilter):
     def group(self, group: frozenset[str]) -> None:
         self._factors.group = group
 
+    @property
+    def nonlinearity(self) -> float:
+        """Second-order residuals of all measurements so far, as shares of their variances, each of one at most."""
+        return self._factors.nonlinearity
+
     def _model(self) -> FactorModel:
         self._factors = JointFactors(self._settings, self._counters)
         return self._factors

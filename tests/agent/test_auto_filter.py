@@ -197,3 +197,21 @@ def test_the_claimed_covariance_covers_the_true_one_in_any_interleaving_of_forms
     for robot, least in slack.items():
         assert least > -ROUNDING, f"{robot} is overconfident by {-least} m^2 (seed {seed})"
     assert changed >= 1
+
+
+def test_measurements_that_keep_being_far_from_linear_are_a_reason_to_hand_over() -> None:
+    """A range of 2 m to a robot that is anywhere within some metres says nothing linear; the first few are forgiven."""
+    cov = np.diag([9.0, 9.0, 0.01])
+    unscented = replace(AUTO, transform="unscented")
+    group = Team(
+        {name: Agent(settings(name, np.array(EVERYWHERE[name]), cov, TARGET, unscented)) for name in ("r1", "r2")}
+    )
+    reasons = []
+    for _ in range(6):
+        step(group)
+        now = group.now_ns
+        group.handle("r1", Observation(now, now, "range", "r2", np.array([5.8]), np.eye(1) * 1e-4, "uwb"))
+        group.converse()
+        reasons.append(group.agents["r1"].status()["form_reason"])
+    assert reasons[0] == "at most 3 robots have met"
+    assert reasons[-1] == "measurements keep being far from linear"
