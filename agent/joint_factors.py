@@ -83,8 +83,8 @@ class JointFactors:
         self.joint = JointLayout(settings)
         self.group: frozenset[str] | None = None
         self.nonlinearity = 0.0
-        """Second-order residuals of all measurements of robots and targets so far, as shares of their variances, each of one
-        at most."""
+        """Second-order residuals of all measurements of robots and targets so far, as shares of their variances, one
+        at most each."""
 
     @property
     def layout(self) -> StateLayout:
