@@ -27,8 +27,8 @@ from agent.estimation.split_joint import Split
 from agent.events import LinkChange, Observation, Received
 from agent.joint_filter import JointFilter
 from agent.joint_room import has_room
-from agent.joint_state import JointState
-from agent.settings import AgentSettings
+from agent.joint_tracks import JointState
+from agent.settings import AgentSettings, TrackEnd
 from agent.split_filter import SplitFilter
 from network.messages import (
     MAX_GROUP,
@@ -61,8 +61,14 @@ class AutoFilter:
         self._joint: JointFilter | None = None
         self._active: CooperativeFilter
         self._lives: dict[str, LinkChange] = {}
-        followed = [(target.id, target.motion.layout) for target in settings.targets] if settings.track else []
-        if has_room(settings.layout, followed):
+        followed = [(target.id, target.motion.layout) for target in settings.tracked]
+        if settings.found_out:
+            self._active = SplitFilter(settings, counters, count_nis)
+            self._why = "the robot has not started with the others"
+        elif settings.track_end != TrackEnd() or any(target.mean is None for target in settings.tracked):
+            self._active = SplitFilter(settings, counters, count_nis)
+            self._why = "tracks start or end"
+        elif has_room(settings.layout, followed):
             self._active = self._joint = JointFilter(settings, counters, count_nis)
             self._joint.group = frozenset((settings.robot,))
             self._why = f"at most {MAX_GROUP} robots have met"
@@ -86,7 +92,7 @@ class AutoFilter:
     def advance(self, t_ns: int, delta: Array, cov: Array) -> None:
         self._active.advance(t_ns, delta, cov)
 
-    def estimate(self) -> Estimate:
+    def estimate(self) -> Estimate | None:
         return self._active.estimate()
 
     def contacts(self) -> dict[str, Epoch]:
@@ -133,7 +139,8 @@ class AutoFilter:
         assert self._joint is not None
         joint, state = self._joint, self._joint.state
         tracks = tuple(track.target for track in joint.estimate().tracks)
-        start = JointState(state.t_ns, state.mean, Split(np.zeros_like(state.cov), state.cov), tracks)
+        split_cov = Split(np.zeros_like(state.cov), state.cov)
+        start = JointState(state.t_ns, state.mean, split_cov, tracks, (state.t_ns,) * len(tracks))
         split = SplitFilter(self._settings, self._counters, self._count_nis, start)
         split.take_over(joint.contacts())
         for event in self._lives.values():

@@ -108,16 +108,23 @@ NO_PAIR = PairRecord()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetState:
-    """Belief of a target at the robot state's instant: mean (n,), cov (n, n), and when something was last learnt."""
+    """Belief of a target at the robot state's instant: mean (n,), cov (n, n), and when it was last changed.
+
+    `learnt_ns`: when something was last learnt of it, by a sighting of whoever told of it.
+    """
 
     mean: Array
     cov: Array
     updated_ns: int = 0
+    learnt_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotState:
-    """Own belief, target beliefs and correlations at one instant. The dictionaries are never changed."""
+    """Own belief, target beliefs and correlations at one instant. The dictionaries are never changed.
+
+    `stranger` is the record of a peer that is not in `pairs`.
+    """
 
     t_ns: int
     mean: Array
@@ -125,13 +132,14 @@ class RobotState:
     stack: CorrelationStack
     pairs: dict[str, PairRecord] = field(default_factory=dict)
     targets: dict[str, TargetState] = field(default_factory=dict)
+    stranger: PairRecord = NO_PAIR
 
     def updated(self, mean: Array, cov: Array, left: Array) -> RobotState:
         """The state after a local update that maps the error by `left` (n, n)."""
-        return RobotState(self.t_ns, mean, cov, self.stack.left(left), self.pairs, self.targets)
+        return RobotState(self.t_ns, mean, cov, self.stack.left(left), self.pairs, self.targets, self.stranger)
 
     def pair(self, peer: str) -> PairRecord:
-        return self.pairs.get(peer, NO_PAIR)
+        return self.pairs.get(peer, self.stranger)
 
     def with_line(self, peer: str, epoch: Epoch, line: Array, max_lines: int) -> RobotState:
         """Open the identity line of a contact; beyond `max_lines` the oldest is forgotten."""

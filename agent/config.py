@@ -23,7 +23,6 @@ from agent.config_file import (
 )
 from agent.config_parts import (
     MAX_TEAM,
-    AgentTargetPart,
     CalibrationPart,
     CoastPart,
     IntrinsicsPart,
@@ -36,9 +35,7 @@ from agent.config_parts import (
     NetworkPart,
     OdometryPart,
     SensorKind,
-    SigmaPart,
     TeamMemberPart,
-    TrackingPart,
 )
 from agent.estimation.motion import LAYOUTS
 from agent.estimation.observation import mount_of
@@ -46,6 +43,8 @@ from agent.joint_room import check_room
 from agent.mavlink import MavlinkEndpointError, parse_endpoint
 from agent.sensor_input import SensorConfig
 from agent.settings import AgentSettings, nanoseconds
+from agent.start_config import InitialPart, check_start
+from agent.target_parts import AgentTargetPart, TrackingPart
 
 _LOOPBACK = re.compile(r"\w+/(127\.\d+\.\d+\.\d+|localhost|\[::1\]):\d+(\?.*)?\Z")
 
@@ -62,14 +61,6 @@ class ClockPart(Part):
     source: Literal["system", "run"] = "system"
     t0_ns: Annotated[int, Field(ge=0)] = 0
     speed: Positive = 1.0
-
-
-class InitialPart(Part):
-    """Initial belief and where it comes from."""
-
-    source: Literal["survey"] = "survey"
-    mean: Annotated[list[Finite], Field(min_length=3, max_length=8)]
-    start_sigma: SigmaPart
 
 
 class AgentSensorPart(Part):
@@ -180,11 +171,13 @@ class AgentConfig(Part):
 
     def settings(self, start_ns: int) -> AgentSettings:
         """What the core is given when it starts at `start_ns`."""
+        mean, cov = self.initial.belief(self.motion)
         return AgentSettings(
             robot=self.identity.robot,
             start_ns=start_ns,
-            mean=self.motion.completed(self.initial.mean),
-            cov=self.initial.start_sigma.covariance(self.motion.model),
+            mean=mean,
+            cov=cov,
+            source=self.initial.source,
             motion=self.motion.settings(),
             targets=tuple(target.settings() for target in self.targets),
             landmarks={item.id: item.place() for item in self.landmarks},
@@ -194,6 +187,8 @@ class AgentConfig(Part):
             coast=self.coast.settings(),
             track=self.tracking.kind != "none",
             team=tuple(member.settings() for member in self.team),
+            track_end=self.tracking.end(),
+            track_within_m=self.tracking.start_within_m,
         )
 
     def sensor_configs(self) -> dict[str, SensorConfig]:
@@ -216,12 +211,19 @@ def load_agent_config(path: Path) -> AgentConfig:
     if sensor is not None:
         raise ConfigError(f"{path}: sensors.{sensor}.intrinsics is missing: pixels mean nothing without focal_px")
     try:
-        config.motion.completed(config.initial.mean)
-        config.initial.start_sigma.covariance(config.motion.model)
+        config.initial.belief(config.motion)
+        check_start(
+            config.initial.source,
+            config.localization,
+            config.motion,
+            {part.kind for part in config.sensors.values()},
+            config.mavlink.fixes if config.mavlink is not None else (),
+        )
     except ConfigError as error:
         raise ConfigError(f"{path}: initial.{error}") from None
     try:
         config.localization.settings()
+        config.tracking.check_kind(config.localization, [t.id for t in config.targets if t.mean is None])
         if config.localization.form == "joint":
             followed = config.targets if config.tracking.kind != "none" else []
             check_room(LAYOUTS[config.motion.model], [(target.id, LAYOUTS[target.model]) for target in followed])

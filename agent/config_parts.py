@@ -13,12 +13,10 @@ from agent.config_file import ConfigError, Finite, Id, LandmarkId, NotNegative, 
 from agent.estimation.gain_motion import GainMotion
 from agent.estimation.motion import (
     LAYOUTS,
-    SPATIAL,
     HeldAltitude,
     RobotMotion,
     SpatialMotion,
     StateLayout,
-    TargetMotion,
 )
 from agent.estimation.observation import Intrinsics
 from agent.estimation.odometry import OdometryNoise
@@ -26,7 +24,6 @@ from agent.settings import (
     CoastSettings,
     LatenessSettings,
     LocalizationSettings,
-    TargetSettings,
     TeamMember,
     nanoseconds,
 )
@@ -77,6 +74,12 @@ class LocalizationPart(Part):
             innovation_cap=cap,
         )
 
+    def rigid(self) -> str | None:
+        """What makes robots begin together, with tracks that last; None: nothing."""
+        if self.kind == "replica":
+            return "kind = 'replica'"
+        return "form = 'joint'" if self.form == "joint" else None
+
     def _refuse_what_pairs_need(self) -> None:
         """Raises `ConfigError` for keys of kind `clat`; a default that is stated is none."""
         plain = LocalizationPart()
@@ -87,10 +90,6 @@ class LocalizationPart(Part):
                 raise ConfigError(
                     f"{key} = {stated!r} is of kind 'clat', and kind 'replica' has no contacts of pairs; {remedy}"
                 )
-
-
-class TrackingPart(Part):
-    kind: Literal["clat", "none"] = "clat"
 
 
 class LatenessPart(Part):
@@ -149,7 +148,7 @@ class LinksPart(Part):
 class SigmaPart(Part):
     """Standard deviations of an initial belief: of x and y, and of what else the state has."""
 
-    position_m: Positive
+    position_m: Positive | None = None
     altitude_m: Positive | None = None
     heading_rad: Positive | None = None
     velocity_mps: Positive | None = None
@@ -157,16 +156,19 @@ class SigmaPart(Part):
     gain_along: Positive | None = None
     gain_turn: Positive | None = None
 
-    def covariance(self, model: str) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """Diagonal covariance of a state of `model`."""
+    def covariance(self, model: str, placed: bool = True) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """Diagonal covariance of a state of `model`; one that is not `placed` has nothing to say of x and y (zeros)."""
         layout = LAYOUTS[model]
+        if placed and self.position_m is None:
+            raise ConfigError("start_sigma.position_m is missing")
         keys = [] if layout.altitude is None else ["altitude_m"]
         if layout.heading is not None:
             keys += ["heading_rad", "gain_along", "gain_turn"][: layout.dim - len(layout.position)]
         else:
             axes = len(layout.position)
             keys += [key for key in ("velocity_mps", "acceleration_mps2") for _ in range(axes)][: layout.dim - axes]
-        sigmas = [self.position_m, self.position_m]
+        place = self.position_m if placed and self.position_m is not None else 0.0
+        sigmas = [place, place]
         for key in keys:
             sigma = getattr(self, key)
             if sigma is None:
@@ -176,17 +178,6 @@ class SigmaPart(Part):
 
 
 RobotModel = Literal["unicycle", "unicycle_gains", "quadrotor", "planar_altitude"]
-TargetModel = Literal[
-    "unicycle",
-    "quadrotor",
-    "constant_velocity",
-    "damped_velocity",
-    "constant_velocity_3d",
-    "damped_velocity_3d",
-    "constant_acceleration",
-]
-
-
 class MotionPart(Part):
     """How the robot moves with its odometry.
 
@@ -321,45 +312,6 @@ class IntrinsicsPart(Part):
         width, height = self.size_px
         u, v = self.center_px or (0.5 * width, 0.5 * height)
         return Intrinsics(self.focal_px, (u, v), (width, height))
-
-
-class AgentTargetPart(Part):
-    """A target as a tracker knows it: common prior and model."""
-
-    id: Id
-    model: TargetModel
-    mean: list[Finite]
-    start_sigma: SigmaPart
-    control: ControlPart = ControlPart()
-    noise: ControlNoisePart = ControlNoisePart()
-    noise_step_s: Positive = 1.0
-    damping_s: Positive = 2.0
-
-    def settings(self) -> TargetSettings:
-        layout = LAYOUTS[self.model]
-        if len(self.mean) != layout.dim:
-            raise ConfigError(f"targets.{self.id}.mean needs {layout.dim} numbers for the model '{self.model}'")
-        return TargetSettings(
-            self.id,
-            target_motion(self.model, self.control, self.noise, self.noise_step_s, self.damping_s),
-            np.array(self.mean),
-            self.start_sigma.covariance(self.model),
-        )
-
-
-def target_motion(
-    model: str, control: ControlPart, noise: ControlNoisePart, noise_step_s: float, damping_s: float
-) -> TargetMotion:
-    """The motion model a table describes. Raises `ConfigError` for a held altitude without noise."""
-    layout, held = LAYOUTS[model], None
-    sigma: tuple[float, ...] = (noise.speed_mps, noise.yaw_rate_radps)
-    if layout is SPATIAL:
-        held = held_altitude(control.altitude_m, noise.altitude_m)
-    elif layout.heading is None:
-        drive = noise.jerk_mps3 if model == "constant_acceleration" else noise.acceleration_mps2
-        sigma = (drive,) * len(layout.position)
-    steer = (control.speed_mps, control.yaw_rate_radps)
-    return TargetMotion(layout, steer, sigma, noise_step_s, damping_s, held=held)
 
 
 class TeamMemberPart(Part):

@@ -95,8 +95,8 @@ class CooperativeFilter(Protocol):
         """When `expire` or `settled` has something to do next."""
         ...
 
-    def estimate(self) -> Estimate:
-        """The own belief and the tracks at the newest instant."""
+    def estimate(self) -> Estimate | None:
+        """The own belief and the tracks at the newest instant; None while the robot does not know where it is."""
         ...
 
     def contacts(self) -> dict[str, Epoch]:

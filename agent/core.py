@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.cooperative_filter import CooperativeFilter
-from agent.effects import Effect, Estimate, Publish
+from agent.effects import Alarm, Effect, Estimate, Publish, TrackEstimate
 from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError, absolute_model, relative_model, told
 from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received, Tick
 from agent.forms import build_filter
 from agent.settings import AgentSettings
 from agent.timeline import Item, OdometryTrack, Phase, Timeline
-from network.messages import PairReply, PairRequest, SplitReply, SplitRequest
+from agent.waiting_filter import WaitingFilter
+from network.messages import PairReply, PairRequest, SplitReply, SplitRequest, StartRequest
 
 Array = NDArray[np.float64]
 
@@ -46,6 +47,8 @@ class Agent:
         self._odometry = OdometryTrack(settings.coast, settings.lateness.tolerance_ns, self.counters)
         self.filter: CooperativeFilter = build_filter(settings, self.counters, self._count_nis)
         self._published: object = None
+        self._tracks: tuple[str, ...] = ()
+        self._missing: tuple[str, ...] = ()
 
     # -- events ---------------------------------------------------------------------------------------------
 
@@ -64,8 +67,32 @@ class Agent:
         self.filter.expire(self.now_ns, effects)
         if self.filter.revision is not self._published:
             self._published = self.filter.revision
-            effects.append(Publish(self.estimate()))
+            estimate = self.estimate()
+            if estimate is not None:
+                effects.append(Publish(estimate))
+                self._tell_ends(tuple(track.target for track in estimate.tracks), effects)
+        missing = self.missing()
+        if missing != self._missing:
+            self._missing = missing
+            effects.append(Alarm("waiting", "; ".join(missing)) if missing else Alarm("started"))
         return effects
+
+    def _tell_ends(self, tracks: tuple[str, ...], effects: list[Effect]) -> None:
+        if tracks != self._tracks:
+            effects.extend(Alarm("track_ended", target) for target in self._tracks if target not in tracks)
+            self._tracks = tracks
+
+    def missing(self) -> tuple[str, ...]:
+        """What the robot waits for before it starts, in words; nothing once it has."""
+        return self.filter.missing() if isinstance(self.filter, WaitingFilter) else ()
+
+    def _start(self) -> None:
+        """Start if the robot has found out where it is."""
+        if isinstance(self.filter, WaitingFilter):
+            begun = self.filter.begun()
+            if begun is not None:
+                self.settings = begun
+                self.filter = build_filter(begun, self.counters, self._count_nis)
 
     def next_deadline_ns(self) -> int:
         """When `handle` wants a `Tick` at the latest, should nothing else happen."""
@@ -81,20 +108,27 @@ class Agent:
             deadline = min(deadline, end + lateness.settle_ns)
         return max(deadline, self.now_ns)
 
-    def estimate(self) -> Estimate:
-        """The own belief and the tracks at the newest instant."""
+    def estimate(self) -> Estimate | None:
+        """The own belief and the tracks at the newest instant; None while the robot waits for its start."""
         return self.filter.estimate()
 
     def status(self) -> dict[str, object]:
         """A plain summary for people: instant, position and its deviation, pairs, counters."""
         estimate = self.filter.estimate()
         form, why = self.filter.form()
+        known: dict[str, object] = {"state": "waiting", "missing": list(self.missing())}
+        if estimate is not None:
+            known = {
+                "state": "running",
+                "x_m": float(estimate.mean[0]),
+                "y_m": float(estimate.mean[1]),
+                "sigma_m": _sigma_m(estimate.cov),
+                "tracks": {track.target: _track_status(track, estimate.t_ns) for track in estimate.tracks},
+            }
         return {
-            "t_ns": estimate.t_ns,
-            "x_m": float(estimate.mean[0]),
-            "y_m": float(estimate.mean[1]),
-            "sigma_m": float(np.sqrt(max(np.trace(estimate.cov[:2, :2]) / 2.0, 0.0))),
-            "lag_s": (self.now_ns - estimate.t_ns) * 1e-9,
+            "t_ns": self.filter.t_ns,
+            **known,
+            "lag_s": (self.now_ns - self.filter.t_ns) * 1e-9,
             "form": form,
             "form_reason": why,
             "waiting": len(self._timeline),
@@ -139,11 +173,12 @@ class Agent:
 
     def _receive(self, event: Received, effects: list[Effect]) -> None:
         body = event.message.body
-        if isinstance(body, PairRequest | SplitRequest):
+        if isinstance(body, PairRequest | SplitRequest | StartRequest):
             self._queue(Item(self.filter.instant_ns(event), Phase.PAIR, event.message.header.source, event))
         elif isinstance(body, PairReply | SplitReply):
             self._drain(effects)
             self.filter.replied(event.message.header.source, body)
+            self._start()
         else:
             self._drain(effects)
             self.filter.heard(event, effects)
@@ -165,6 +200,7 @@ class Agent:
             try:
                 self._advance(item.t_ns)
                 self._process(item, effects)
+                self._start()
             except OutOfViewError:
                 self.counters["observation.out_of_view"] += 1
             except np.linalg.LinAlgError:
@@ -191,6 +227,11 @@ class Agent:
     def _process(self, item: Item, effects: list[Effect]) -> None:
         event = item.event
         if isinstance(event, Received):
+            started_by_peer = self.settings.shared is not None
+            if started_by_peer and item.t_ns <= self.settings.start_ns + self.settings.lateness.tolerance_ns:
+                # The belief at the start may have come of this very contact, told once more.
+                self.counters["start.told_again"] += 1
+                return
             self.filter.requested(event, item.t_ns, effects)
         elif isinstance(event, Fix):
             fix = absolute_model(event.kind, self.settings.layout, event.z, event.R)
@@ -245,3 +286,13 @@ class Agent:
         entry = self.nis.setdefault(kind, NisSum())
         entry.total += nis
         entry.count += 1
+
+
+def _sigma_m(cov: Array) -> float:
+    """Standard deviation of x and y, root mean square of both."""
+    return float(np.sqrt(max(np.trace(cov[:2, :2]) / 2.0, 0.0)))
+
+
+def _track_status(track: TrackEstimate, t_ns: int) -> dict[str, float]:
+    found = {"x_m": float(track.mean[0]), "y_m": float(track.mean[1]), "sigma_m": _sigma_m(track.cov)}
+    return found if track.learnt_ns is None else {**found, "age_s": max(t_ns - track.learnt_ns, 0) * 1e-9}

@@ -32,12 +32,16 @@ class Broadcast:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackEstimate:
-    """Belief of one target at the estimate's instant: mean (n,), cov (n, n) over a state of `model`."""
+    """Belief of one target at the estimate's instant: mean (n,), cov (n, n) over a state of `model`.
+
+    `learnt_ns`: when something was last learnt of it, by whoever saw it; None: not kept.
+    """
 
     target: str
     model: str
     mean: Array
     cov: Array
+    learnt_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,12 +18,14 @@ from agent.cooperative_filter import refusal
 from agent.effects import Effect, Estimate, Send, TrackEstimate
 from agent.estimation.colocalization import Options, Update, sighting_update
 from agent.estimation.observation import AbsoluteModel, RelativeModel, relative_model
+from agent.estimation.track_start import TrackStart
 from agent.events import LinkChange, Observation, Received
 from agent.factor_model import AnySnapshot, FactorModel, SeparateModel
 from agent.history import History
 from agent.pairs import Pairs
 from agent.settings import AgentSettings
-from network.messages import Body, Epoch, Measurement, PairReply, PairRequest, SplitRequest
+from agent.tracks import TrackRules
+from network.messages import Body, Epoch, Measurement, PairReply, PairRequest, SplitRequest, StartRequest
 
 Array = NDArray[np.float64]
 
@@ -36,6 +38,7 @@ class FactorFilter:
     ) -> None:
         self._settings, self._counters, self._count_nis = settings, counters, count_nis
         self._motions = {t.id: t.motion for t in settings.targets}
+        self._rules = TrackRules(settings)
         self.model = self._model()
         self.state = self.model.initial()
         self.history = History(settings, self.model, self.state)
@@ -53,12 +56,14 @@ class FactorFilter:
         return self.state
 
     def advance(self, t_ns: int, delta: Array, cov: Array) -> None:
-        self.state = self.history.advance(self.state, t_ns, delta, cov)
+        before = self.state
+        self.state = self.history.advance(before, t_ns, delta, cov)
+        self._counters["track.ended"] += len(before.targets) - len(self.state.targets)
 
     def estimate(self) -> Estimate:
         state = self.state
         tracks = tuple(
-            TrackEstimate(name, self._motions[name].layout.name, target.mean, target.cov)
+            TrackEstimate(name, self._motions[name].layout.name, target.mean, target.cov, target.learnt_ns)
             for name, target in state.targets.items()
         )
         return Estimate(state.t_ns, self._settings.layout.name, state.mean, state.cov, tracks)
@@ -119,7 +124,7 @@ class FactorFilter:
         return update.nis
 
     def sighting(self, t_ns: int, target: str, event: Observation) -> None:
-        if target not in self.state.targets:
+        if target not in self._rules:
             self._counters["observation.unknown_target"] += 1
             return
         then = self._when(t_ns, target)
@@ -127,14 +132,27 @@ class FactorFilter:
             self._counters["late.target_dropped"] += 1
             return
         late = then is not self.state
-        belief = then.targets[target]
         localization = self._settings.localization
-        motion = self._motions[target]
-        layout = motion.layout
+        layout = self._motions[target].layout
+        model = relative_model(event, self._settings.layout, layout)
+        belief, now = then.targets.get(target), (then.mean, then.cov)
+        if belief is None:
+            start = self._rules.started(target, model, now, then.t_ns, event.z, event.R)
+            if start is None:
+                start = self._rules.started_vaguely(target, model, now, then.t_ns, event.z, event.R)
+            self._counters["track.started" if start is not None else "track.undetermined"] += 1
+        else:
+            track_now = belief.mean, belief.cov
+            start = self._rules.begun_again(target, model, now, track_now, then.t_ns, event.z, event.R)
+            self._counters["track.begun_again"] += start is not None
+        if start is not None:
+            self._start_track(then, target, start)
+        if start is not None or belief is None:
+            return
         own, track, nis = sighting_update(
             (then.mean, then.cov, self._settings.layout),
             (belief.mean, belief.cov, layout),
-            relative_model(event, self._settings.layout, layout),
+            model,
             event.z,
             event.R,
             localization.sighting_weight,
@@ -152,22 +170,39 @@ class FactorFilter:
         elif own is not None:
             state = state.updated(own.mean, own.cov, own.left)
         if track is not None:
-            mean, cov = track.mean, track.cov
-            if state.t_ns > then.t_ns:
-                drifted = motion.drift(mean, cov, (state.t_ns - then.t_ns) * 1e-9, localization.transform)
-                mean, cov = drifted.mean, drifted.cov
-            state = replace(state, targets={**state.targets, target: TargetState(mean, cov, then.t_ns)})
+            found = self._drifted(target, track.mean, track.cov, then.t_ns)
+            state = replace(state, targets={**state.targets, target: found})
         if state is not self.state:
             self.state = state
             self.history.updated(state, None if own is None or late else own.left)
+
+    def _drifted(self, target: str, mean: Array, cov: Array, t_ns: int) -> TargetState:
+        """A track of `t_ns` at the newest instant."""
+        dt_s = (self.state.t_ns - t_ns) * 1e-9
+        if dt_s > 0.0:
+            drifted = self._motions[target].drift(mean, cov, dt_s, self._settings.localization.transform)
+            mean, cov = drifted.mean, drifted.cov
+        return TargetState(mean, cov, t_ns, t_ns)
+
+    def _start_track(self, then: RobotState, target: str, start: TrackStart) -> None:
+        """Keep a track that starts at the instant of `then`.
+
+        Its correlation with the own error is unknown from then on, as that of every track of these forms.
+        """
+        found = self._drifted(target, start.mean, start.cov(then.cov), then.t_ns)
+        self._counters["used.sighting_target"] += 1
+        self.state = replace(self.state, targets={**self.state.targets, target: found})
+        self.history.updated(self.state)
 
     def _when(self, t_ns: int, target: str) -> RobotState | None:
         """The state a sighting at `t_ns` is used in. A late one is used where nothing new was learnt since."""
         if not self._late(t_ns):
             return self.state
         then = None if self._settings.lateness.kind == "discard" else self.history.cut(t_ns)
-        if then is None or target not in then.targets:
+        if then is None:
             return None
+        if target not in then.targets or target not in self.state.targets:
+            return then if target not in then.targets and target not in self.state.targets else None
         last = self.state.targets[target].updated_ns
         return then if last == then.targets[target].updated_ns and last <= t_ns else None
 
@@ -182,11 +217,14 @@ class FactorFilter:
 
     def instant_ns(self, event: Received) -> int:
         body = event.message.body
-        assert isinstance(body, PairRequest | SplitRequest)
+        assert isinstance(body, PairRequest | SplitRequest | StartRequest)
         return body.epoch.t_meas_ns - self._pairs.clocks.offset_ns(event)
 
     def requested(self, event: Received, t_ns: int, effects: list[Effect]) -> None:
         body = event.message.body
+        if isinstance(body, StartRequest):
+            self._pairs.asked(event, body, t_ns, self.history, effects)
+            return
         if not isinstance(body, PairRequest) or not isinstance(body.snapshot, self.model.snapshot_type):
             self._counters["pair.other_form"] += 1
             if isinstance(body, PairRequest):

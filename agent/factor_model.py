@@ -14,13 +14,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.belief import CorrelationStack, Part, RobotState, TargetState, Transition
+from agent.belief import CorrelationStack, PairRecord, Part, RobotState, TargetState, Transition
 from agent.estimation.colocalization import Contact, Options, Update, absolute_update, contact
 from agent.estimation.gaussian import symmetrize, wrap_components
 from agent.estimation.intersection import fuse
 from agent.estimation.motion import STATES, StateLayout
 from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.settings import AgentSettings
+from agent.tracks import TrackRules, track_ended
 from network.messages import (
     MAX_LINES,
     MAX_MESSAGE_BYTES,
@@ -107,7 +108,10 @@ class FactorModel(Protocol):
 
 
 def moved(settings: AgentSettings, state: RobotState, t_ns: int, delta: Array, cov: Array) -> tuple[RobotState, Array]:
-    """State and targets predicted to `t_ns` with an odometry increment; returns (state, F (n, n))."""
+    """State and targets predicted to `t_ns` with an odometry increment; returns (state, F (n, n)).
+
+    Tracks that are over by then are left out.
+    """
     localization = settings.localization
     dt_s = (t_ns - state.t_ns) * 1e-9
     own = settings.motion.advance(state.mean, state.cov, delta, cov, dt_s, localization.transform)
@@ -116,8 +120,10 @@ def moved(settings: AgentSettings, state: RobotState, t_ns: int, delta: Array, c
         belief = state.targets.get(target.id)
         if belief is not None:
             drifted = target.motion.drift(belief.mean, belief.cov, dt_s, localization.transform)
-            targets[target.id] = TargetState(drifted.mean, drifted.cov, belief.updated_ns)
-    return RobotState(t_ns, own.mean, own.cov, state.stack.left(own.F), state.pairs, targets), own.F
+            if not track_ended(settings.track_end, target.motion.layout, drifted.cov, belief.learnt_ns, t_ns):
+                targets[target.id] = replace(belief, mean=drifted.mean, cov=drifted.cov)
+    stack = state.stack.left(own.F)
+    return RobotState(t_ns, own.mean, own.cov, stack, state.pairs, targets, state.stranger), own.F
 
 
 class SeparateModel:
@@ -129,6 +135,7 @@ class SeparateModel:
     def __init__(self, settings: AgentSettings, counters: Counter[str]) -> None:
         self._settings, self._counters = settings, counters
         self._motions = {target.id: target.motion for target in settings.targets}
+        self._rules = TrackRules(settings)
         localization = settings.localization
         self.options = Options(localization.transform, localization.parameters, localization.innovation_cap)
 
@@ -139,8 +146,13 @@ class SeparateModel:
     def initial(self) -> RobotState:
         settings = self._settings
         stack = CorrelationStack(np.zeros((len(settings.mean), 0)))
-        targets = {t.id: TargetState(t.mean, t.cov) for t in settings.targets if settings.track}
-        return RobotState(settings.start_ns, settings.mean, settings.cov, stack, {}, targets)
+        start_ns = settings.start_ns
+        targets = {
+            t.id: TargetState(t.mean, t.cov, start_ns, start_ns) for t in settings.tracked if t.mean is not None
+        }
+        # Who starts with an error that peers hold too is correlated with all of them, nobody knows how.
+        stranger = PairRecord(known=settings.shared is None)
+        return RobotState(start_ns, settings.mean, settings.cov, stack, {}, targets, stranger)
 
     def moved(self, state: RobotState, t_ns: int, delta: Array, cov: Array) -> tuple[RobotState, Transition]:
         after, F = moved(self._settings, state, t_ns, delta, cov)
@@ -160,7 +172,11 @@ class SeparateModel:
             assert block is not None
             lines.append(Line(epoch, block))
         targets = tuple(
-            TargetBelief(name, Belief(self._motions[name].layout.name, target.mean, target.cov))
+            TargetBelief(
+                name,
+                Belief(self._motions[name].layout.name, target.mean, target.cov),
+                max(state.t_ns - target.learnt_ns, 0),
+            )
             for name, target in list(state.targets.items())[:MAX_TARGETS]
         )
         return Snapshot(
@@ -221,13 +237,18 @@ class SeparateModel:
         for told in other.targets:
             own = targets.get(told.target)
             motion = self._motions.get(told.target)
-            if own is None or motion is None or told.belief.model != motion.layout.name:
+            if told.target not in self._rules or motion is None or told.belief.model != motion.layout.name:
                 self._counters["target.unknown"] += 1
                 continue
-            mean, cov = told.belief.mean, told.belief.cov
+            mean, cov, learnt_ns = told.belief.mean, told.belief.cov, t_ns - told.age_ns
             if state.t_ns > t_ns:
                 drifted = motion.drift(mean, cov, (state.t_ns - t_ns) * 1e-9, localization.transform)
                 mean, cov = drifted.mean, drifted.cov
+            if own is None:
+                if not self._rules.ended(told.target, cov, learnt_ns, state.t_ns):
+                    self._counters["track.started"] += 1
+                    targets[told.target] = TargetState(mean, cov, state.t_ns, learnt_ns)
+                continue
             angles = motion.layout.angles
             if localization.correlation == "factors":
                 mean, cov, _ = fuse(own.mean, own.cov, mean, cov, angles, localization.fusion_weight)
@@ -235,5 +256,5 @@ class SeparateModel:
                 gain = own.cov @ np.linalg.inv(own.cov + cov)
                 mean = wrap_components(own.mean + gain @ wrap_components(mean - own.mean, angles), angles)
                 cov = symmetrize(own.cov - gain @ own.cov)
-            targets[told.target] = TargetState(mean, cov, state.t_ns)
+            targets[told.target] = TargetState(mean, cov, state.t_ns, max(own.learnt_ns, learnt_ns))
         return replace(state, targets=targets) if targets else state

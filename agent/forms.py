@@ -12,12 +12,15 @@ from agent.joint_filter import JointFilter
 from agent.replica_filter import ReplicaFilter
 from agent.settings import AgentSettings
 from agent.split_filter import SplitFilter
+from agent.waiting_filter import WaitingFilter
 
 
 def build_filter(
     settings: AgentSettings, counters: Counter[str], count_nis: Callable[[str, float], None]
 ) -> CooperativeFilter:
-    """The filter of `settings.localization`."""
+    """The filter of `settings.localization`; of a robot that does not know where it is, one that waits for it."""
+    if settings.source != "survey":
+        return WaitingFilter(settings, counters)
     if settings.localization.kind == "replica":
         return ReplicaFilter(settings, counters, count_nis)
     if settings.localization.form == "split_joint":

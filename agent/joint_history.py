@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.motion import split_increment
-from agent.joint_state import JointModel, JointState
+from agent.joint_state import JointModel
+from agent.joint_tracks import JointState
 from agent.settings import LatenessSettings
 
 Array = NDArray[np.float64]

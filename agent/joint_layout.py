@@ -79,10 +79,11 @@ class Met:
 
 
 class JointLayout:
-    """The joint state of one robot and the targets of its settings, in their order."""
+    """The joint state of one robot and of `tracks`, in their order; by default those of all targets it may track."""
 
-    def __init__(self, settings: AgentSettings) -> None:
-        targets = settings.targets if settings.track else ()
+    def __init__(self, settings: AgentSettings, tracks: tuple[str, ...] | None = None) -> None:
+        known = {target.id: target for target in settings.tracked}
+        targets = [known[name] for name in (known if tracks is None else tracks)]
         localization = settings.localization
         self._settings = settings
         self._transform, self._parameters = localization.transform, localization.parameters
@@ -102,11 +103,11 @@ class JointLayout:
         self.models = tuple((name, motion.layout.name) for name, motion in self.motions.items())
 
     def start(self) -> tuple[Array, Array]:
-        """Mean (n,) and covariance (n, n) at the start."""
+        """Mean (n,) and covariance (n, n) at the start; every target has a prior."""
         settings = self._settings
-        targets = [target for target in settings.targets if target.id in self.motions]
-        mean = np.concatenate([settings.mean, *(target.mean for target in targets)])
-        return mean, block_diagonal([settings.cov, *(target.cov for target in targets)])
+        priors = [(target.mean, target.cov) for target in settings.tracked if target.mean is not None]
+        mean = np.concatenate([settings.mean, *(mean for mean, _ in priors)])
+        return mean, block_diagonal([settings.cov, *(cov for _, cov in priors)])
 
     def moved(self, mean: Array, cov: Array, dt_s: float, delta: Array, delta_cov: Array) -> Moved:
         """The robot by an odometry increment (4,), (4, 4), the targets by their models over `dt_s`."""

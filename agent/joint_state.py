@@ -1,8 +1,8 @@
 """A robot and its targets as one belief with a split error covariance, and what happens to it, as pure functions.
 
-The robot's state comes first, the targets' follow in a fixed order. Noise of the own motion and sensors is private
-until it is told; the targets' prior and process noise are the same for every robot that tracks them, hence shared from
-the start (see `agent.estimation.split_joint`).
+The robot's state comes first, the targets' tracks follow in the order they were started in. Noise of the own motion and
+sensors is private until it is told; the targets' prior and process noise are the same for every robot that tracks them,
+hence shared from the start (see `agent.estimation.split_joint`).
 """
 
 from __future__ import annotations
@@ -13,10 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.colocalization import Options, sighting_update
 from agent.estimation.gaussian import is_positive_definite, symmetrize, wrap_components
 from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.estimation.split_joint import Split, SplitUpdate, update_from_peer, update_own, update_own_recurring
 from agent.joint_layout import JointLayout
+from agent.joint_tracks import JointState, JointTracks, learnt
 from agent.settings import AgentSettings
 from network.messages import Measurement, SplitSnapshot
 
@@ -40,25 +42,11 @@ NEGLIGIBLE = 1e-2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class JointState:
-    """mean (n,) and split covariance (n, n) of the robot followed by `tracks`, at `t_ns`."""
-
-    t_ns: int
-    mean: Array
-    split: Split
-    tracks: tuple[str, ...]
-
-    @property
-    def cov(self) -> Array:
-        return self.split.cov
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Used:
-    """A state after information was used, and the NIS per degree of freedom of that."""
+    """A state after information was used, and the NIS per degree of freedom of that; None if there was none."""
 
     state: JointState
-    nis: float
+    nis: float | None
 
 
 class JointModel:
@@ -66,38 +54,86 @@ class JointModel:
 
     def __init__(self, settings: AgentSettings) -> None:
         self._settings = settings
-        self._layout = JointLayout(settings)
+        self._layouts: dict[tuple[str, ...], JointLayout] = {}
+        self._own = slice(0, settings.layout.dim)
+        self.tracks = JointTracks(settings)
 
-    def initial(self) -> JointState:
-        """The state at the start: the own error is private, that of the targets' common prior is shared."""
-        mean, cov = self._layout.start()
-        own = self._layout.own
-        private = np.zeros_like(cov)
-        private[own, own] = cov[own, own]
-        return JointState(self._settings.start_ns, mean, Split(private, cov - private), self._layout.tracks)
-
-    def blocks(self, state: JointState) -> list[slice]:
-        """Components of each track, in order."""
-        return list(self._layout.blocks)
+    def _layout(self, state: JointState) -> JointLayout:
+        found = self._layouts.get(state.tracks)
+        if found is None:
+            found = self._layouts[state.tracks] = JointLayout(self._settings, state.tracks)
+        return found
 
     # -- motion ---------------------------------------------------------------------------------------------
 
     def moved(self, state: JointState, t_ns: int, delta: Array, delta_cov: Array) -> JointState:
-        """The state at `t_ns`: the robot by an odometry increment (4,), (4, 4), the targets by their models."""
+        """The state at `t_ns`: the robot by an odometry increment (4,), (4, 4), the targets by their models.
+
+        Tracks that are over by then are left out.
+        """
         dt_s = (t_ns - state.t_ns) * 1e-9
-        found = self._layout.moved(state.mean, state.cov, dt_s, delta, delta_cov)
+        found = self._layout(state).moved(state.mean, state.cov, dt_s, delta, delta_cov)
         split = state.split.mapped(found.F, found.own_noise, found.target_noise)
-        return JointState(t_ns, found.mean, split, state.tracks)
+        return self.tracks.aged(replace(state, t_ns=t_ns, mean=found.mean, split=split), dt_s)
 
     # -- own measurements -----------------------------------------------------------------------------------
 
     def absolute(self, state: JointState, model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> Used:
         """Use information about the own state alone."""
-        return self._measured(state, model, z, R, self._layout.own, 1.0)
+        return self._measured(state, model, z, R, self._own, 1.0)
 
     def sighting(self, state: JointState, target: str, model: RelativeModel, z: Array, R: Array) -> Used:
-        """Use a relative measurement of a target of `state.tracks`."""
-        return self._measured(state, model, z, R, self._layout.with_target(target), RESIDUAL_FACTOR)
+        """Use a relative measurement of a target, or start its track; a state without one is left alone otherwise."""
+        own = state.mean[self._own], state.cov[self._own, self._own]
+        if target not in state.tracks:
+            start = self.tracks.rules.started(target, model, own, state.t_ns, z, R)
+            if start is not None:
+                return Used(self.tracks.started(state, target, start, state.t_ns), None)
+            beside = self._beside(state, target, model, z, R)
+            if beside is not None:
+                return beside
+            state = self.tracks.joined(state, target)
+        else:
+            block = self._layout(state).blocks[state.tracks.index(target)]
+            track = state.mean[block], state.cov[block, block]
+            again = self.tracks.rules.begun_again(target, model, own, track, state.t_ns, z, R)
+            if again is not None:
+                state = self.tracks.without(state, {target})
+                return Used(self.tracks.started(state, target, again, state.t_ns), None)
+        used = self._measured(state, model, z, R, self._layout(state).with_target(target), RESIDUAL_FACTOR)
+        return replace(used, state=learnt(used.state, {target: state.t_ns}))
+
+    def _beside(
+        self, state: JointState, target: str, model: RelativeModel, z: Array, R: Array
+    ) -> Used | None:
+        """Use a sighting that tells no place, of a target without a track in the joint belief; None: it may join that.
+
+        A vague track stays beside the joint belief, whose pose it leaves alone, and so does one that began vaguely.
+        """
+        own, rules = (state.mean[self._own], state.cov[self._own, self._own]), self.tracks.rules
+        known = state.relayed.get(target)
+        if known is None:
+            start = rules.started_vaguely(target, model, own, state.t_ns, z, R)
+            if start is None:
+                return Used(state, None)
+            return Used(self.tracks.beside(state, target, start.mean, start.cov(own[1])), None)
+        track = known.mean, known.cov
+        if known.firm and not rules.vague(own, track):
+            return None
+        localization, layout = self._settings.localization, model.subject
+        _, update, nis = sighting_update(
+            (*own, self._settings.layout),
+            (*track, layout),
+            model,
+            z,
+            R,
+            localization.sighting_weight,
+            True,
+            Options(localization.transform, localization.parameters, localization.innovation_cap),
+        )
+        if update is not None:
+            track = update.mean, update.cov
+        return Used(self.tracks.beside(state, target, *track), nis)
 
     def _measured(
         self,
@@ -108,7 +144,7 @@ class JointModel:
         part: slice | list[int],
         residual_factor: float,
     ) -> Used:
-        seen = self._layout.seen(state.mean, state.cov, part, model, z, R, residual_factor)
+        seen = self._layout(state).seen(state.mean, state.cov, part, model, z, R, residual_factor)
         update: SplitUpdate | None
         if residual_factor > 1.0 and seen.residual.trace() > NEGLIGIBLE * R.trace():
             update = update_own_recurring(state.split, seen.H, seen.noise, RECURRING * symmetrize(seen.residual))
@@ -122,25 +158,29 @@ class JointModel:
         """Raises `numpy.linalg.LinAlgError` if the covariance is not positive definite any more."""
         if not is_positive_definite(split.cov):
             raise np.linalg.LinAlgError("covariance is not positive definite")
-        mean = wrap_components(state.mean + correction, self._layout.state.angles)
+        mean = wrap_components(state.mean + correction, self._layout(state).state.angles)
         return replace(state, mean=mean, split=split)
 
     # -- peers ----------------------------------------------------------------------------------------------
 
-    def snapshot(self, state: JointState, tracks: Sequence[str]) -> SplitSnapshot:
-        """What a peer is told of the state: the robot and `tracks`."""
-        part = list(range(self._layout.own.stop))
-        for name, block in zip(state.tracks, self._layout.blocks):
+    def snapshot(self, state: JointState, tracks: Sequence[str], relayed: int = 0) -> SplitSnapshot:
+        """What a peer is told of the state: the robot, `tracks`, and the first of its relayed tracks."""
+        part, ages = list(range(self._own.stop)), []
+        layout = self._layout(state)
+        for name, block, learnt_ns in zip(state.tracks, layout.blocks, state.learnt_ns):
             if name in tracks:
                 part += range(block.start, block.stop)
+                ages.append(max(state.t_ns - learnt_ns, 0))
         square = np.ix_(part, part)
         private = state.split.private[square]
         return SplitSnapshot(
             self._settings.layout.name,
-            tuple(item for item in self._layout.models if item[0] in tracks),
+            tuple(item for item in layout.models if item[0] in tracks),
             state.mean[part],
             state.cov[square],
             private if private.any() else None,
+            tuple(ages),
+            self.tracks.told(state)[:relayed],
         )
 
     def from_peer(
@@ -156,14 +196,17 @@ class JointModel:
         `own_observed`: the own sensor measured the peer, not the other way round. `trusted`: what the peer calls its
         private noise is uncorrelated with the own error still. The state is left alone if nothing is gained.
         """
-        own = SplitSnapshot(self._settings.layout.name, self._layout.models, state.mean, state.cov)
+        layout = self._layout(state)
+        own = SplitSnapshot(self._settings.layout.name, layout.models, state.mean, state.cov)
         i, j = (own, told) if own_observed else (told, own)
-        met = self._layout.met(i, j, None, measurements, RESIDUAL_FACTOR, SAME_TARGET_M2)
+        met = layout.met(i, j, None, measurements, RESIDUAL_FACTOR, SAME_TARGET_M2)
         H_own, H_other = (met.H_i, met.H_j) if own_observed else (met.H_j, met.H_i)
         k = len(told.mean)
         private = told.private if trusted and told.private is not None else np.zeros((k, k))
         other, recurring = Split(private, told.cov - private), RECURRING * symmetrize(met.residual)
         update = update_from_peer(state.split, other, H_own, H_other, met.R, recurring)
-        if update is None:
-            return Used(state, met.nis)
-        return Used(self._shifted(state, update.K @ met.nu, update.split), met.nis)
+        if update is not None:
+            state = self._shifted(state, update.K @ met.nu, update.split)
+            ages = zip(told.targets, told.ages_ns)
+            state = learnt(state, {name: state.t_ns - age_ns for (name, _), age_ns in ages})
+        return Used(self.tracks.heard(state, told), met.nis)

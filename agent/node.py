@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from agent.core import Agent
-from agent.effects import Broadcast, Effect, Estimate, Publish, Send
+from agent.effects import Alarm, Broadcast, Effect, Estimate, Publish, Send
 from agent.events import Event, LinkChange, Received, Tick
 from agent.sensor_input import SensorConfig, SensorError, decode
 from agent.settings import AgentSettings
@@ -24,7 +24,7 @@ class Outgoing:
 
     packets: list[Packet] = field(default_factory=list)
     estimates: list[Estimate] = field(default_factory=list)
-    alarms: list[str] = field(default_factory=list)
+    alarms: list[Alarm] = field(default_factory=list)
 
 
 class Node:
@@ -103,6 +103,8 @@ class Node:
                     self._transmit(lambda: self.endpoint.broadcast(event.t_ns, channel, t_meas_ns, body), out)
                 case Publish(estimate):
                     out.estimates.append(estimate)
+                case Alarm():
+                    out.alarms.append(effect)
 
     def _transmit(self, make: Callable[[], Packet], out: Outgoing) -> None:
         """A message that cannot be told (too large, or degenerate numbers) is counted, never fatal."""

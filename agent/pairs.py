@@ -19,7 +19,7 @@ from agent.history import History
 from agent.pair_clock import PairClocks
 from agent.pairing import PairExchange, Step
 from agent.settings import AgentSettings
-from network.messages import MAX_MEASUREMENTS, Epoch, Measurement, PairReply, PairRequest, ReplyStatus
+from network.messages import MAX_MEASUREMENTS, Epoch, Measurement, PairReply, PairRequest, ReplyStatus, StartRequest
 
 Array = NDArray[np.float64]
 
@@ -139,6 +139,23 @@ class Pairs:
         effects.append(Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.OK, own))))
         state = history.opened(then.t_ns, peer, epoch)
         return self._apply(peer, epoch, request.snapshot, own, request.measurements, False, t_ns, state, history)
+
+    def asked(
+        self, event: Received, request: StartRequest, t_ns: int, history: History, effects: list[Effect]
+    ) -> None:
+        """A peer that does not know where it is has measured this robot and asks for its belief; nothing is kept of it.
+
+        Whatever comes of that, the peer takes its correlation with everybody for unknown.
+        """
+        peer, then = event.message.header.source, history.cut(t_ns)
+        if then is None:
+            self._counters["pair.too_old"] += 1
+            effects.append(Send(peer, request.epoch.t_meas_ns, PairReply(request.epoch, ReplyStatus.TOO_OLD)))
+            return
+        told = self._model.fitting(self._model.snapshot(then, peer), peer, (), None)
+        if told is not None:
+            self._counters["start.answers"] += 1
+            effects.append(Send(peer, request.epoch.t_meas_ns, PairReply(request.epoch, ReplyStatus.OK, told)))
 
     def reply(self, peer: str, reply: PairReply, state: RobotState, history: History) -> RobotState:
         """The peer answered a contact."""

@@ -32,6 +32,7 @@ from network.messages import (
     PairRequest,
     RawMeasurement,
     SplitRequest,
+    StartRequest,
     TeamReport,
 )
 from network.wire_team import MAX_INDEX
@@ -219,7 +220,7 @@ class ReplicaFilter:
 
     def instant_ns(self, event: Received) -> int:
         body = event.message.body
-        assert isinstance(body, PairRequest | SplitRequest)
+        assert isinstance(body, PairRequest | SplitRequest | StartRequest)
         return body.epoch.t_meas_ns - self._clocks.offset_ns(event)
 
     def requested(self, event: Received, t_ns: int, effects: list[Effect]) -> None:

@@ -77,12 +77,25 @@ class CoastSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetSettings:
-    """A target all robots know of: its model and the common prior at the start."""
+    """A target all robots know of: its model, and the common prior at the start, mean (n,) and cov (n, n).
+
+    Without a mean nobody knows where it is, and a sighting or a peer starts its track: `cov` is then of what a sighting
+    does not tell, velocity or heading, which are 0 as far as is known, and an altitude about `altitude_m`.
+    """
 
     id: str
     motion: TargetMotion
-    mean: Array
+    mean: Array | None
     cov: Array
+    altitude_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class TrackEnd:
+    """When a track ends: nothing learnt for `after_ns`, or a position deviation above `above_m`; None: never."""
+
+    after_ns: int | None = None
+    above_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +110,16 @@ class TeamMember:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AgentSettings:
-    """Everything the core is given at its start."""
+    """Everything the core is given at its start.
+
+    source           where the initial belief comes from: `survey`, mean and cov as they are; `fix`, absolute
+                     information of place and heading; `peer`, a contact with a peer that knows its own pose. Of mean
+                     and cov only what neither tells, the gains of an odometry, counts then
+    shared           the part (n, n) of cov that stems from errors which peers may hold too; None: nothing of it
+    found_out        the robot has found out where it is, and starts later than the others
+    track_within_m   how far off a target can be that is seen by a bearing or a range alone; None: such a sighting
+                     starts no track
+    """
 
     robot: str
     start_ns: int
@@ -112,7 +134,17 @@ class AgentSettings:
     coast: CoastSettings = field(default_factory=CoastSettings)
     track: bool = True
     team: tuple[TeamMember, ...] = ()
+    track_end: TrackEnd = TrackEnd()
+    track_within_m: float | None = None
+    source: Literal["survey", "fix", "peer"] = "survey"
+    shared: Array | None = None
+    found_out: bool = False
 
     @property
     def layout(self) -> StateLayout:
         return self.motion.layout
+
+    @property
+    def tracked(self) -> tuple[TargetSettings, ...]:
+        """The targets there may be tracks of."""
+        return self.targets if self.track else ()

@@ -25,7 +25,7 @@ from agent.autopilot import AutopilotReader
 from agent.config import AgentConfig
 from agent.config_file import ConfigError
 from agent.control import ControlLine
-from agent.effects import Estimate
+from agent.effects import Alarm, Estimate
 from agent.events import Event
 from agent.fleet_clock import FleetClock
 from agent.lateness_figures import LatenessFigures
@@ -44,6 +44,7 @@ log = logging.getLogger("cofix.agent")
 SOFTWARE = "cofix-0.1.0"
 PUBLISH_INTERVAL_S = 0.1
 STATUS_INTERVAL_S = 0.5
+ALARM_INTERVAL_S = 60.0
 MAX_SOCKET_PATH = 100
 
 
@@ -75,6 +76,7 @@ class AgentShell:
         self._timer: asyncio.TimerHandle | None = None
         self._timer_due_ns = self._timer_set_ns = self._start_ns = 0
         self._published_s = 0.0
+        self._warned_s: dict[Alarm, float] = {}
         self._lags = LatenessFigures()
         self._stop = asyncio.Event()
         self.counters: Counter[str] = Counter()
@@ -263,12 +265,22 @@ class AgentShell:
         assert self._transport is not None
         for packet in out.packets:
             self._transport.send(packet)
+        for alarm in out.alarms:
+            self._warn(alarm)
         if out.estimates:
             wall = time.monotonic()
             if wall - self._published_s >= PUBLISH_INTERVAL_S:
                 self._published_s = wall
                 self._transport.publish(Channel.ESTIMATE, estimate_bytes(out.estimates[-1]))
         self._arm()
+
+    def _warn(self, alarm: Alarm) -> None:
+        """Log an alarm, an equal one once per window."""
+        wall = time.monotonic()
+        if wall - self._warned_s.get(alarm, -ALARM_INTERVAL_S) >= ALARM_INTERVAL_S:
+            self._warned_s = {known: at for known, at in self._warned_s.items() if wall - at < ALARM_INTERVAL_S}
+            self._warned_s[alarm] = wall
+            log.warning("%s", f"{alarm.reason}: {alarm.detail}" if alarm.detail else alarm.reason)
 
     def _arm(self) -> None:
         """Set the timer to the node's next deadline; never a busy loop."""

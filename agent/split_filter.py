@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,8 @@ from agent.estimation.observation import (
 )
 from agent.events import LinkChange, Observation, Received
 from agent.joint_history import JointHistory, Learnt
-from agent.joint_state import JointModel, JointState, Used
+from agent.joint_state import JointModel, Used
+from agent.joint_tracks import JointState
 from agent.pair_clock import PairClocks
 from agent.settings import AgentSettings
 from agent.split_exchange import SplitExchange
@@ -32,6 +34,7 @@ from network.messages import (
     MAX_JOINT_DIM,
     MAX_MEASUREMENTS,
     MAX_MESSAGE_BYTES,
+    MAX_TARGETS,
     Body,
     Epoch,
     Measurement,
@@ -39,6 +42,7 @@ from network.messages import (
     SplitReply,
     SplitRequest,
     SplitSnapshot,
+    StartRequest,
 )
 from network.wire import size_bound
 
@@ -61,7 +65,8 @@ class SplitFilter:
         """`start`: the first state, by default that of the settings."""
         self._settings, self._counters, self._count_nis = settings, counters, count_nis
         self._model = JointModel(settings)
-        self.history = JointHistory(self._model, settings.lateness, start or self._model.initial(), counters)
+        first = start or self._model.tracks.initial()
+        self.history = JointHistory(self._model, settings.lateness, first, counters)
         self._motions = {target.id: target.motion for target in settings.targets}
         self._clocks = PairClocks(settings)
         self._exchanges: dict[str, SplitExchange] = {}
@@ -82,7 +87,16 @@ class SplitFilter:
         return self.state
 
     def advance(self, t_ns: int, delta: Array, cov: Array) -> None:
+        before = self.state
         self.history.advance(t_ns, delta, cov)
+        self._count_tracks(before)
+
+    def _count_tracks(self, before: JointState) -> None:
+        """Tracks that have appeared or gone since the newest state was `before`."""
+        if self.state.tracks != before.tracks or self.state.relayed.keys() != before.relayed.keys():
+            now, then = {*self.state.tracks, *self.state.relayed}, {*before.tracks, *before.relayed}
+            self._counters["track.started"] += len(now - then)
+            self._counters["track.ended"] += len(then - now)
 
     def estimate(self) -> Estimate:
         state, n = self.state, self._settings.layout.dim
@@ -90,8 +104,11 @@ class SplitFilter:
             return self._told_of[1]
         cov = state.cov
         tracks = tuple(
-            TrackEstimate(name, self._motions[name].layout.name, state.mean[block], cov[block, block])
-            for name, block in zip(state.tracks, self._model.blocks(state))
+            TrackEstimate(name, self._motions[name].layout.name, state.mean[block], cov[block, block], learnt_ns)
+            for name, block, learnt_ns in zip(state.tracks, self._model.tracks.blocks(state), state.learnt_ns)
+        ) + tuple(
+            TrackEstimate(name, self._motions[name].layout.name, track.mean, track.cov, track.learnt_ns)
+            for name, track in state.relayed.items()
         )
         found = Estimate(state.t_ns, self._settings.layout.name, state.mean[:n], cov[:n, :n], tracks)
         self._told_of = state, found
@@ -136,14 +153,15 @@ class SplitFilter:
         if late:
             self._counters["late.compensated"] += 1
         self._counters[f"used.{kind}"] += 1
-        self._count_nis(kind, used.nis)
+        if used.nis is not None:
+            self._count_nis(kind, used.nis)
 
     def sighting(self, t_ns: int, target: str, event: Observation) -> None:
         then = self._at(t_ns)
         if then is None:
             self._counters["late.target_dropped"] += 1
             return
-        if target not in then.tracks:
+        if target not in self._model.tracks.rules:
             self._counters["observation.unknown_target"] += 1
             return
         late = then is not self.state
@@ -151,10 +169,15 @@ class SplitFilter:
         used = self._learn(then, lambda state: self._model.sighting(state, target, model, event.z, event.R))
         if used is None:
             return
+        if used.state is then and used.nis is None:
+            # Kept all the same: a sighting that comes late may have started the track before.
+            self._counters["track.undetermined"] += 1
+            return
         if late:
             self._counters["late.target_compensated"] += 1
         self._counters["used.sighting"] += 1
-        self._count_nis(f"target_{event.kind}", used.nis)
+        if used.nis is not None:
+            self._count_nis(f"target_{event.kind}", used.nis)
 
     def _learn(self, then: JointState, use: Callable[[JointState], Used], again: Learnt | None = None) -> Used | None:
         """Use information at the instant of `then`; `again`: how it is used if earlier information turns up later."""
@@ -165,7 +188,9 @@ class SplitFilter:
         except np.linalg.LinAlgError:
             self._counters["update.not_positive_definite"] += 1
             return None
+        before = self.state
         self.history.learn(used.state, again or (lambda state: use(state).state))
+        self._count_tracks(before)
         return used
 
     # -- peers ----------------------------------------------------------------------------------------------
@@ -178,15 +203,20 @@ class SplitFilter:
 
     def _told(self, then: JointState, measurements: tuple[Measurement, ...]) -> SplitSnapshot:
         """The belief as it is sent, with as many tracks as fit; its private noise is shared from now on."""
-        tracks = list(then.tracks)
+        tracks, relayed = list(then.tracks), len(then.relayed)
         while True:
-            snapshot = self._model.snapshot(then, tracks)
-            fits = len(snapshot.mean) <= MAX_JOINT_DIM and (
-                size_bound(SplitRequest(LONGEST, measurements, snapshot)) <= MAX_MESSAGE_BYTES
+            snapshot = self._model.snapshot(then, tracks, relayed)
+            fits = (
+                len(snapshot.mean) <= MAX_JOINT_DIM
+                and len(tracks) + relayed <= MAX_TARGETS
+                and size_bound(SplitRequest(LONGEST, measurements, snapshot)) <= MAX_MESSAGE_BYTES
             )
-            if fits or not tracks:
+            if fits or not (tracks or relayed):
                 break
-            tracks.pop()
+            if relayed:
+                relayed -= 1
+            else:
+                tracks.pop()
             self._counters["pair.shortened"] += 1
         if snapshot.private is not None:
             self.history.learn(_shared(then), _shared)
@@ -214,11 +244,17 @@ class SplitFilter:
 
     def instant_ns(self, event: Received) -> int:
         body = event.message.body
-        assert isinstance(body, PairRequest | SplitRequest)
+        assert isinstance(body, PairRequest | SplitRequest | StartRequest)
         return body.epoch.t_meas_ns - self._clocks.offset_ns(event)
 
     def requested(self, event: Received, t_ns: int, effects: list[Effect]) -> None:
         peer, request = event.message.header.source, event.message.body
+        if isinstance(request, StartRequest):
+            then = self.history.at(t_ns)
+            self._counters["start.answers" if then is not None else "pair.too_old"] += 1
+            if then is not None:
+                effects.append(Send(peer, request.epoch.t_meas_ns, SplitReply(request.epoch, self._told(then, ()))))
+            return
         if not isinstance(request, SplitRequest):
             self._counters["pair.other_form"] += 1
             if isinstance(request, PairRequest):
@@ -284,7 +320,8 @@ class SplitFilter:
         if used is None:
             return
         self._contacts[peer] = epoch
-        self._count_nis("pair_" + "+".join(item.kind for item in measurements), used.nis)
+        if used.nis is not None:
+            self._count_nis("pair_" + "+".join(item.kind for item in measurements), used.nis)
         self._counters["pair.applied_initiator" if own_initiated else "pair.applied_responder"] += 1
 
     def heard(self, event: Received, effects: list[Effect]) -> None:
@@ -318,7 +355,7 @@ class SplitFilter:
 
 
 def _shared(state: JointState) -> JointState:
-    return JointState(state.t_ns, state.mean, state.split.told(), state.tracks)
+    return replace(state, split=state.split.told())
 
 
 def _usable(told: SplitSnapshot) -> bool:

@@ -124,7 +124,7 @@ class TeamHistory:
         self.targets = tuple(target.id for target in targets)
         joint = CentralizedFilter(
             {name: robots[name] for name in self.robots},
-            {target.id: (target.mean, target.cov, target.motion) for target in targets},
+            {target.id: (target.mean, target.cov, target.motion) for target in targets if target.mean is not None},
             settings.landmarks,
             localization.transform,
             localization.innovation_cap,

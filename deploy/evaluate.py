@@ -94,6 +94,8 @@ def _sample(
                 contacts.append(((event.t_ns - t0_ns) * 1e-9, robot, peer))
             for effect in made:
                 if isinstance(effect, Publish):
+                    while latest is None and next_row * stride_ns + ahead < effect.estimate.t_ns - t0_ns:
+                        next_row += 1  # Before the robot knew where it is.
                     settle(effect.estimate.t_ns - t0_ns)
                     latest = effect.estimate
         if latest is not None:

@@ -186,7 +186,7 @@ def _cells(exit_code: int | None, status: dict[str, Any]) -> list[str]:
     if exit_code is not None:
         return [f"[red]ended ({exit_code})[/red]", *blank]
     if "x_m" not in status:
-        return ["starting", *blank]
+        return ["waiting" if status.get("missing") else "starting", "; ".join(status.get("missing", [])), *blank[1:]]
     counters = status.get("counters", {})
     contacts = counters.get("pair.applied_initiator", 0) + counters.get("pair.applied_responder", 0)
     peers = " ".join(peer for peer, up in sorted(status.get("peers", {}).items()) if up)

@@ -36,6 +36,7 @@ from network.messages import (
     PairRequest,
     SplitReply,
     SplitRequest,
+    StartRequest,
 )
 from network.peers import Peer, PeerTable
 from network.wire import OversizeError, decode, encode
@@ -291,6 +292,6 @@ def _belongs(body: Body, channel: str) -> bool:
     """Whether a body of this type may travel on this channel."""
     if isinstance(body, Hello):
         return channel == Channel.HELLO
-    if isinstance(body, PairRequest | PairReply | SplitRequest | SplitReply):
+    if isinstance(body, PairRequest | PairReply | SplitRequest | SplitReply | StartRequest):
         return channel == Channel.PAIR
     return channel == Channel.BELIEF

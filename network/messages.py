@@ -115,10 +115,11 @@ class Belief:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetBelief:
-    """One robot's belief of one target."""
+    """One robot's belief of one target; `age_ns`: how long ago something was last learnt of it, by whomever."""
 
     target: str
     belief: Belief
+    age_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -230,12 +231,24 @@ class PairReply:
     snapshot: Snapshot | JointSnapshot | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class StartRequest:
+    """Asks a peer for its belief at `epoch.t_meas_ns`, when a robot that does not know where it is has measured it.
+
+    The answer is a reply of the peer's form.
+    """
+
+    epoch: Epoch
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SplitSnapshot:
     """A robot and targets as one belief whose error covariance is split, before a contact's update.
 
     mean (n,), cov (n, n) over the robot's state followed by those of `targets` (id, model), in order; private (n, n) is
-    the part of cov that stems from noise nobody else holds, None if there is none.
+    the part of cov that stems from noise nobody else holds, None if there is none. `ages_ns`: how long ago something
+    was last learnt of each target, by whomever. `relayed`: targets the robot only knows of from others, correlated in
+    unknown ways.
     """
 
     model: str
@@ -243,6 +256,8 @@ class SplitSnapshot:
     mean: Array
     cov: Array
     private: Array | None = None
+    ages_ns: tuple[int, ...] = ()
+    relayed: tuple[TargetBelief, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -306,7 +321,7 @@ class TeamReport:
     measurements: tuple[RawMeasurement, ...] = ()
 
 
-Body = Hello | PairRequest | PairReply | SplitRequest | SplitReply | TeamReport
+Body = Hello | PairRequest | PairReply | SplitRequest | SplitReply | StartRequest | TeamReport
 
 
 @dataclass(frozen=True, slots=True, eq=False)

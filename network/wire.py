@@ -42,6 +42,7 @@ from network.messages import (
     SplitReply,
     SplitRequest,
     SplitSnapshot,
+    StartRequest,
     TargetBelief,
     TeamReport,
 )
@@ -76,7 +77,7 @@ from network.wire_fields import (
 from network.wire_team import pack_report, read_report
 
 _HELLO, _PAIR_REQUEST, _PAIR_REPLY, _SPLIT_REQUEST, _SPLIT_REPLY, _TEAM_REPORT = 1, 2, 3, 4, 5, 6
-_JOINT_REQUEST, _JOINT_REPLY = 7, 8
+_JOINT_REQUEST, _JOINT_REPLY, _START_REQUEST = 7, 8, 9
 _HEADER_BYTES = 3 + 25 + 5 * 9 + 1
 """Upper bound of what surrounds a body: array marks, schema, longest source, five integers, kind."""
 
@@ -158,6 +159,8 @@ def _pack_body(body: Body) -> tuple[int, tuple[Any, ...]]:
         return _SPLIT_REPLY, (pack_epoch(body.epoch), _pack_split(body.snapshot))
     if isinstance(body, TeamReport):
         return _TEAM_REPORT, pack_report(body)
+    if isinstance(body, StartRequest):
+        return _START_REQUEST, (pack_epoch(body.epoch),)
     raise TypeError(f"{type(body).__name__} is not a message body")
 
 
@@ -171,15 +174,26 @@ def _pack_snapshot(snapshot: Snapshot) -> tuple[Any, ...]:
         pack_array(snapshot.factor, (n, columns)),
         pack_array(snapshot.line, (n, n)),
         tuple((pack_epoch(line.epoch), pack_array(line.matrix, (n, n))) for line in snapshot.lines),
-        tuple((target.target, *pack_belief(target.belief)) for target in snapshot.targets),
+        tuple(_pack_target(target) for target in snapshot.targets),
         snapshot.known,
     )
 
 
+def _pack_target(target: TargetBelief) -> tuple[Any, ...]:
+    return (target.target, *pack_belief(target.belief), target.age_ns)
+
+
 def _pack_split(snapshot: SplitSnapshot) -> tuple[Any, ...]:
     n = len(snapshot.mean)
-    private = None if snapshot.private is None else pack_cov(snapshot.private, n)
-    return snapshot.model, snapshot.targets, pack_array(snapshot.mean, (n,)), pack_cov(snapshot.cov, n), private
+    return (
+        snapshot.model,
+        snapshot.targets,
+        pack_array(snapshot.mean, (n,)),
+        pack_cov(snapshot.cov, n),
+        None if snapshot.private is None else pack_cov(snapshot.private, n),
+        snapshot.ages_ns,
+        tuple(_pack_target(target) for target in snapshot.relayed),
+    )
 
 
 def _pack_joint(snapshot: JointSnapshot) -> tuple[Any, ...]:
@@ -275,8 +289,8 @@ def _line(raw: Any, n: int) -> Line:
 
 
 def _target(raw: Any) -> TargetBelief:
-    fields = read_fields(raw, 5)
-    return TargetBelief(read_id(fields[0]), read_belief(fields[1:]))
+    fields = read_fields(raw, 6)
+    return TargetBelief(read_id(fields[0]), read_belief(fields[1:5]), read_integer(fields[5]))
 
 
 def _snapshot(raw: Any) -> Snapshot:
@@ -360,15 +374,20 @@ def _robot_and_targets(model: Any, targets_raw: Any) -> tuple[tuple[tuple[str, s
 
 
 def _split(raw: Any) -> SplitSnapshot:
-    model, targets_raw, mean, cov_raw, private_raw = read_fields(raw, 5)
+    model, targets_raw, mean, cov_raw, private_raw, ages_raw, relayed_raw = read_fields(raw, 7)
     targets, n, _ = _robot_and_targets(model, targets_raw)
+    ages_ns = tuple(read_integer(item) for item in read_items(ages_raw, MAX_TARGETS))
+    relayed = tuple(_target(item) for item in read_items(relayed_raw, MAX_TARGETS))
+    names = {name for name, _ in targets} | {item.target for item in relayed}
+    if len(ages_ns) != len(targets) or len(names) != len(targets) + len(relayed):
+        raise WireError("malformed")
     cov = read_cov(cov_raw, n, BELIEF_FLOOR, "not_positive_definite")
     private = None
     if private_raw is not None:
         private = read_array(private_raw, n * (n + 1) // 2)[FULL[n]]
         if not is_part(private, cov):
             raise WireError("not_positive_definite")
-    return SplitSnapshot(model, targets, read_array(mean, n), cov, private)
+    return SplitSnapshot(model, targets, read_array(mean, n), cov, private, ages_ns, relayed)
 
 
 def _joint(raw: Any) -> JointSnapshot:
@@ -434,6 +453,14 @@ def _joint_reply(raw: Any, header: Header) -> PairReply:
     return PairReply(read_contact(epoch), ReplyStatus.OK, _joint(snapshot))
 
 
+def _start_request(raw: Any, header: Header) -> StartRequest:
+    (epoch_raw,) = read_fields(raw, 1)
+    epoch = read_contact(epoch_raw)
+    if epoch.initiator != header.source:
+        raise WireError("source_mismatch")
+    return StartRequest(epoch)
+
+
 _STATUSES = frozenset(int(status) for status in ReplyStatus)
 _BODIES: dict[int, Callable[[Any, Header], Body]] = {
     _HELLO: _hello,
@@ -444,4 +471,5 @@ _BODIES: dict[int, Callable[[Any, Header], Body]] = {
     _TEAM_REPORT: read_report,
     _JOINT_REQUEST: _joint_request,
     _JOINT_REPLY: _joint_reply,
+    _START_REQUEST: _start_request,
 }

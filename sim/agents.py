@@ -22,15 +22,16 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
     mean, _ = world.start_belief(robot.id)
     targets = []
     for target in scenario.targets:
-        target_mean, _ = world.start_belief(target.id)
+        control, noise = target.assumed()
+        prior = {"mean": [float(value) for value in world.start_belief(target.id)[0]]} if target.prior else {}
         targets.append(
             {
                 "id": target.id,
                 "model": target.model,
-                "mean": [float(value) for value in target_mean],
+                **prior,
                 "start_sigma": table(target.start_sigma),
-                "control": table(target.control),
-                "noise": table(target.noise),
+                "control": table(control),
+                "noise": table(noise),
                 "noise_step_s": scenario.step_s,
                 "damping_s": target.damping_s,
             }
@@ -40,8 +41,8 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
         "identity": {"fleet": FLEET, "robot": robot.id, "incarnation": 1},
         "origin": list(scenario.origin),
         "initial": {
-            "source": "survey",
-            "mean": [float(value) for value in mean],
+            "source": robot.start_source,
+            **({"mean": [float(value) for value in mean]} if robot.start_source == "survey" else {}),
             "start_sigma": table(robot.start_sigma),
         },
         "motion": table(robot.motion()),

@@ -16,6 +16,7 @@ from agent.events import LEVEL, Odometry
 from agent.sensor_input import SensorConfig
 from agent.settings import CoastSettings, nanoseconds
 from agent.timeline import OdometryTrack, Phase
+from agent.tracks import unseen_mean
 from sim.scenario import Scenario, sensor_config
 from sim.world import Output, World, order
 
@@ -62,26 +63,33 @@ class BoundRunner:
                 self._shown.use(item, self._sensors)
         self._shown.move_to(end)
 
-    def belief(self, entity: str) -> tuple[Array, Array]:
-        """Marginal mean (n,) and covariance (n, n)."""
-        return self._shown.filter.belief(entity)
+    def belief(self, entity: str) -> tuple[Array, Array] | None:
+        """Marginal mean (n,) and covariance (n, n); None of a target without a prior that nobody has seen."""
+        return self._shown.filter.belief(entity) if entity in self._shown.filter else None
 
 
 class _Joint:
     """The joint filter and the instants its parts have been brought to."""
 
     def __init__(self, scenario: Scenario, world: World) -> None:
-        robots, targets = {}, {}
+        robots, targets, unseen = {}, {}, {}
         for robot in scenario.robots:
             robots[robot.id] = (*world.start_belief(robot.id), robot.motion().settings())
         for target in scenario.targets:
-            targets[target.id] = (*world.start_belief(target.id), target.motion(scenario.step_s))
+            motion = target.motion(scenario.step_s)
+            if target.prior:
+                targets[target.id] = (*world.start_belief(target.id), motion)
+            else:
+                cov = target.start_sigma.covariance(target.model, placed=False)
+                unseen[target.id] = (unseen_mean(motion.layout, target.control.altitude_m), cov, motion)
         self.filter = CentralizedFilter(
             robots,
             targets,
             world.landmarks,
             transform=scenario.localization.transform,
             innovation_cap=scenario.localization.innovation_cap or 0.0,
+            unseen=unseen,
+            within_m=scenario.tracking.start_within_m,
         )
         coast = CoastSettings(scenario.coast.speed_mps, scenario.coast.yaw_rate_radps)
         self._tracks = {name: OdometryTrack(coast, 0, Counter()) for name in world.robots}

@@ -119,9 +119,11 @@ class Sampler:
         means, covs = self._owned[robot, entity]
         means[row], covs[row] = mean, cov
 
-    def put_bound(self, entity: str, row: int, belief: tuple[Array, Array]) -> None:
+    def put_bound(self, entity: str, row: int, belief: tuple[Array, Array] | None) -> None:
+        """None: there is no belief (yet)."""
         assert self._bound is not None
-        self._bound[entity][0][row], self._bound[entity][1][row] = belief
+        if belief is not None:
+            self._bound[entity][0][row], self._bound[entity][1][row] = belief
 
     def trace(self) -> TrialTrace:
         truths = {
@@ -312,6 +314,8 @@ class VirtualEngine:
             return
         for robot, node in self._nodes.items():
             estimate = node.agent.estimate()
+            if estimate is None:
+                continue
             self._sampler.put(robot, robot, row, estimate.mean, estimate.cov)
             for track in estimate.tracks:
                 self._sampler.put(robot, track.target, row, track.mean, track.cov)

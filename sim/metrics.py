@@ -106,7 +106,7 @@ def _positive_definite(cov: Array) -> NDArray[np.bool_]:
     return usable
 
 
-def _reduced(trace: StateTrace, inside: NDArray[np.bool_], stride: int) -> dict[str, Any]:
+def _reduced(trace: StateTrace, t_s: Array, inside: NDArray[np.bool_], stride: int) -> dict[str, Any]:
     """Counts and sums over the window, extremes, last error, and every `stride`-th sample for the series.
 
     `heading` and `velocity` are sums of squares, None for a state that has no such components.
@@ -114,6 +114,7 @@ def _reduced(trace: StateTrace, inside: NDArray[np.bool_], stride: int) -> dict[
     error, ratio = errors(trace), nees(trace)
     squared = np.sum(error[:, list(trace.position)] ** 2, axis=1)
     seen = np.isfinite(error).all(axis=1)
+    estimated = np.isfinite(trace.mean).all(axis=1)
     use = inside & seen
     within = error[use]
     sigma = np.sqrt(np.maximum(np.diagonal(trace.cov, axis1=1, axis2=2)[use], 0.0))
@@ -125,6 +126,9 @@ def _reduced(trace: StateTrace, inside: NDArray[np.bool_], stride: int) -> dict[
         "names": names,
         "known": bool(np.isfinite(trace.truth).any()),
         "count": int(use.sum()),
+        "window": int(inside.sum()),
+        "estimated": int((inside & estimated).sum()),
+        "started": float(t_s[estimated][0]) if estimated.any() else None,
         "position": float(squared[use].sum()),
         "heading": float(np.sum(within[:, list(trace.angles)] ** 2)) if trace.angles else None,
         "velocity": float(np.sum(within[:, velocity] ** 2)) if velocity else None,
@@ -165,7 +169,7 @@ def reduce_trial(
     stride = max(1, -(-len(trace.t_s) // MAX_SERIES))
 
     def states(items: dict[str, StateTrace], *, ratios: bool = False) -> dict[str, Any]:
-        found = {name: _reduced(item, inside, stride) for name, item in items.items()}
+        found = {name: _reduced(item, trace.t_s, inside, stride) for name, item in items.items()}
         if not ratios:
             for entry in found.values():
                 del entry["nees_series"]
@@ -245,7 +249,9 @@ def _entity(items: Sequence[dict[str, Any]], robot: bool) -> dict[str, Any]:
     over all samples of all trials, `position_error_max_m` is the largest of all; `final_position_error_m` is the median
     over trials of the last error. Of each component's absolute error, `error_min` and `error_max` are medians over
     trials of the smallest and largest in a trial, `error_worst` is the largest of all. `dof` is the size of the state.
-    `position_rmse_2s_m` and `error_max_2s_m` of a track are of instants shortly after a sighting of its target.
+    `started_s` is the median over trials of the first instant with an estimate, `known_share` the share of the window
+    that has one. `position_rmse_2s_m` and `error_max_2s_m` of a track are of instants shortly after a sighting of its
+    target.
     """
     names = items[0]["names"]
     figures: dict[str, Any] = {"dof": len(names), "position_rmse_m": _rmse(items)}
@@ -259,6 +265,8 @@ def _entity(items: Sequence[dict[str, Any]], robot: bool) -> dict[str, Any]:
         recent = [item["recent"] for item in items]
         figures["position_rmse_2s_m"] = _rmse(recent)
         figures["error_max_2s_m"] = _largest([item["max_position"] for item in recent])
+    figures["started_s"] = _median([item["started"] for item in items])
+    figures["known_share"] = sum(item["estimated"] for item in items) / max(sum(item["window"] for item in items), 1)
     figures["anees"] = _anees(items)
     figures["containment_3sigma"] = _ratio(items, "inside")
     for key, of, over in (

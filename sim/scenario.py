@@ -42,15 +42,14 @@ from agent.config_parts import (
     RobotModel,
     SensorKind,
     SigmaPart,
-    TargetModel,
-    TrackingPart,
-    target_motion,
 )
 from agent.estimation.motion import LAYOUTS, TargetMotion
 from agent.estimation.observation import RELATIVE_ANGLES, mount_of
 from agent.joint_room import check_room
 from agent.sensor_input import SensorConfig
 from agent.settings import nanoseconds
+from agent.start_config import StartSource, check_start
+from agent.target_parts import TargetModel, TrackingPart, target_motion
 
 Subject = Literal["peers", "landmarks", "targets"]
 
@@ -148,13 +147,18 @@ class AutopilotPart(Part):
 
 
 class RobotPart(Part):
-    """A robot; `tilt_rad` is the standard deviation of its roll and pitch, new at every instant and known to it."""
+    """A robot.
+
+    `start_source` is where it has its start from, see `agent.start_config`; `tilt_rad` is the standard deviation of its
+    roll and pitch, new at every instant and known to it.
+    """
 
     id: Id
     model: RobotModel = "unicycle"
     gain_walk_per_sqrt_s: NotNegative = 0.003
     start: StartPart = StartPart()
     start_sigma: SigmaPart
+    start_source: StartSource = "survey"
     control: ControlPart = ControlPart()
     noise: ControlNoisePart = ControlNoisePart()
     odometry: OdometryPart | None = None
@@ -176,18 +180,32 @@ class RobotPart(Part):
 
 
 class TargetPart(Part):
+    """A target. Without a `prior` no robot knows of its place before it is seen.
+
+    With `assumed_noise` its control is unknown to the robots, but for an altitude: they take it to be none, with this
+    noise.
+    """
+
     id: Id
     model: TargetModel = "unicycle"
     recorded: bool = False
+    prior: bool = True
     start: StartPart = StartPart()
     start_sigma: SigmaPart
     control: ControlPart = ControlPart()
     noise: ControlNoisePart = ControlNoisePart()
+    assumed_noise: ControlNoisePart | None = None
     damping_s: Positive = 2.0
+
+    def assumed(self) -> tuple[ControlPart, ControlNoisePart]:
+        """Control and noise as the robots know them."""
+        if self.assumed_noise is None:
+            return self.control, self.noise
+        return ControlPart(altitude_m=self.control.altitude_m), self.assumed_noise
 
     def motion(self, step_s: float) -> TargetMotion:
         """How an estimator takes the target to move."""
-        return target_motion(self.model, self.control, self.noise, step_s, self.damping_s)
+        return target_motion(self.model, *self.assumed(), step_s, self.damping_s)
 
 
 class CentralizedPart(Part):
@@ -370,11 +388,17 @@ def check(scenario: Scenario) -> None:
         localization, tracking = scenario.localization_of(robot), scenario.tracking_of(robot)
         try:
             localization.settings()
+            tracking.check_kind(localization, [target.id for target in scenario.targets if not target.prior])
             if localization.form == "joint":
                 followed = scenario.targets if tracking.kind != "none" else []
                 check_room(LAYOUTS[robot.model], [(target.id, LAYOUTS[target.model]) for target in followed])
         except ConfigError as error:
             raise ConfigError(f"{scenario.name}: localization: {error}") from None
+        try:
+            kinds = {sensor_kind(name, sensor) for name, sensor in robot.sensors.items()}
+            check_start(robot.start_source, localization, robot.motion(), kinds, ())
+        except ConfigError as error:
+            raise ConfigError(f"{scenario.name}: robots.{robot.id}.start_{error}") from None
         if not recorded and (robot.start.pose is None) == (robot.start.circle is None):
             raise ConfigError(f"{scenario.name}: robots.{robot.id}.start needs either 'pose' or 'circle'")
         if robot.start.circle is not None and scenario.world.placement is None:
@@ -435,7 +459,7 @@ def _check_steering(scenario: Scenario) -> None:
 def _check_mover(where: str, part: RobotPart | TargetPart) -> None:
     """Deviations of the start, altitude noise and size of the pose are those the model needs."""
     try:
-        part.start_sigma.covariance(part.model)
+        part.start_sigma.covariance(part.model, isinstance(part, RobotPart) or part.prior)
     except ConfigError as error:
         raise ConfigError(f"{where}.{error}") from None
     try:

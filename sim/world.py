@@ -195,7 +195,8 @@ class SimulatedWorld:
         """True states (steps + 1, n) of a target that is pushed at random."""
         dt, axes = self._scenario.step_s, len(layout.position)
         F, Q = velocity_step(layout, dt, target.damping_s)
-        (sigma, *_), order = target.motion(dt).noise_sigma, layout.dim // axes
+        order = layout.dim // axes
+        sigma = target.noise.jerk_mps3 if order == 3 else target.noise.acceleration_mps2
         root = np.linalg.cholesky(Q[::axes, ::axes]) * sigma * np.sqrt(dt)
         names = ("control", "acceleration", "jerk")[:order]
         draws = np.stack([normal_rows(self._seed, self.steps, axes, target.id, name) for name in names], axis=1)

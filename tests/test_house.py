@@ -36,7 +36,13 @@ PURE = (
     "sim/noise.py",
     "sim/metrics.py",
 )
-CONFIG_ONLY = ("agent/config.py", "agent/config_file.py", "agent/config_parts.py", "sim/scenario.py")
+CONFIG_ONLY = (
+    "agent/config.py",
+    "agent/config_file.py",
+    "agent/config_parts.py",
+    "agent/start_config.py",
+    "sim/scenario.py",
+)
 
 
 def imports(path: Path) -> set[str]:

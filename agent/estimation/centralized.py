@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from agent.estimation.gaussian import gain, quadratic_form, symmetrize, wrap_components
 from agent.estimation.motion import RobotMotion, TargetMotion
 from agent.estimation.observation import AbsoluteModel, RelativeModel, absolute_model
+from agent.estimation.track_start import start_track, start_vaguely
 from agent.estimation.unscented import Propagated, Transform, observe
 from agent.events import LEVEL
 from network.messages import NO_MOUNT, Mount
@@ -22,7 +23,11 @@ Array = NDArray[np.float64]
 
 
 class CentralizedFilter:
-    """Joint belief of robots {id: (mean (n,), cov (n, n), motion)} and targets {id: (mean, cov, motion)}."""
+    """Joint belief of robots {id: (mean (n,), cov (n, n), motion)} and targets {id: (mean, cov, motion)}.
+
+    Targets in `unseen`, {id: (mean, cov, motion)} with nothing known of x and y, join when a sighting tells where they
+    are; a bearing or a range alone does so, vaguely, if they are `within_m`.
+    """
 
     def __init__(
         self,
@@ -31,8 +36,11 @@ class CentralizedFilter:
         landmarks: dict[str, tuple[float, ...]],
         transform: Transform = "unscented",
         innovation_cap: float = 0.0,
+        unseen: dict[str, tuple[Array, Array, TargetMotion]] | None = None,
+        within_m: float | None = None,
     ) -> None:
         self._landmarks, self._transform, self._cap = landmarks, transform, innovation_cap
+        self._unseen, self._within_m = dict(unseen or {}), within_m
         self._motions = {name: motion for name, (_, _, motion) in targets.items()}
         self._robot_motions = {name: motion for name, (_, _, motion) in robots.items()}
         self._layouts = {name: motion.layout for name, motion in self._robot_motions.items()}
@@ -55,7 +63,13 @@ class CentralizedFilter:
         """A filter of its own with the same belief."""
         other = copy.copy(self)
         other.mean, other.cov = self.mean.copy(), self.cov.copy()
+        other._unseen, other._motions = dict(self._unseen), dict(self._motions)
+        other._layouts, other._parts = dict(self._layouts), dict(self._parts)
         return other
+
+    def __contains__(self, name: str) -> bool:
+        """Whether there is a belief of a robot or target."""
+        return name in self._parts
 
     def belief(self, name: str) -> tuple[Array, Array]:
         """Marginal mean (n,) and covariance (n, n)."""
@@ -93,16 +107,40 @@ class CentralizedFilter:
     ) -> float:
         """A relative measurement of `r2`, `landmark:L3` or `target:t1`: its NIS per degree of freedom.
 
-        Raises `OutOfViewError` for a pixel of what is out of view; nothing has happened then.
+        Raises `OutOfViewError` for a pixel of what is out of view; nothing has happened then. A target that is `unseen`
+        has no NIS, which is told as 0.
         """
         rows, layout = self._rows(robot), self._layouts[robot]
         if of.startswith("landmark:"):
             model = RelativeModel(kind, layout, mount, self._landmarks[of.removeprefix("landmark:")], attitude=attitude)
         else:
             name = of.removeprefix("target:")
+            if name in self._unseen:
+                subject = self._unseen[name][2].layout
+                self._start(name, robot, RelativeModel(kind, layout, mount, subject=subject, attitude=attitude), z, R)
+                return 0.0
             rows = np.concatenate([rows, self._rows(name)])
             model = RelativeModel(kind, layout, mount, subject=self._layouts[name], attitude=attitude)
         return self._update(rows, model, z, R)
+
+    def _start(self, name: str, robot: str, model: RelativeModel, z: Array, R: Array) -> None:
+        """Take in a target that a robot sees, if that tells where it is."""
+        mean, cov, motion = self._unseen[name]
+        start = start_track(model, self.belief(robot), (mean, cov), z, R)
+        if start is None and self._within_m is not None:
+            start = start_vaguely(model, self.belief(robot), (mean, cov), z, R, self._within_m)
+        if start is None:
+            return
+        del self._unseen[name]
+        n, d, own = len(self.mean), len(mean), self._parts[robot]
+        self._parts[name], self._motions[name], self._layouts[name] = slice(n, n + d), motion, motion.layout
+        self._angles += tuple(n + index for index in motion.layout.angles)
+        joint = np.zeros((n + d, n + d))
+        joint[:n, :n] = self.cov
+        joint[n:, :n] = start.G @ self.cov[own, :]
+        joint[:n, n:] = joint[n:, :n].T
+        joint[n:, n:] = start.cov(self.cov[own, own])
+        self.mean, self.cov = np.concatenate([self.mean, start.mean]), joint
 
     def _rows(self, name: str) -> NDArray[np.intp]:
         part = self._parts[name]

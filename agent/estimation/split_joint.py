@@ -43,7 +43,7 @@ class Split:
         return self.private + self.shared
 
     def mapped(self, A: Array, private_noise: Array | None = None, shared_noise: Array | None = None) -> Split:
-        """The split after the error was mapped by A (n, n) and independent noise was added to either part."""
+        """The split after the error was mapped by A (m, n) and independent noise (m, m) was added to either part."""
         private, shared = A @ self.private @ A.T, A @ self.shared @ A.T
         if private_noise is not None:
             private = private + private_noise

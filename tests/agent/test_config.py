@@ -18,10 +18,10 @@ from agent.config_parts import (
     LocalizationPart,
     OdometryPart,
     SigmaPart,
-    target_motion,
 )
 from agent.estimation.motion import SPATIAL, HeldAltitude, SpatialMotion
 from agent.estimation.observation import Intrinsics, planar_mount
+from agent.target_parts import target_motion
 
 
 def example(**change: Any) -> dict[str, Any]:

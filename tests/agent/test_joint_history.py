@@ -20,7 +20,7 @@ STEP, NOISE = np.array([0.4, 0.1, 0.0, 0.1]), np.diag([0.01, 0.02, 0.0, 0.001])
 
 def driven(steps: int, horizon_s: float = 60.0) -> tuple[JointHistory, Counter[str]]:
     model, counters = JointModel(SETTINGS), Counter[str]()
-    history = JointHistory(model, LatenessSettings(horizon_ns=round(horizon_s * NS)), model.initial(), counters)
+    history = JointHistory(model, LatenessSettings(horizon_ns=round(horizon_s * NS)), model.tracks.initial(), counters)
     for k in range(1, steps + 1):
         history.advance(k * NS, STEP, NOISE)
     return history, counters

@@ -33,7 +33,7 @@ def model(transform: str, names: tuple[str, ...] = ("t1",)) -> JointModel:
 @pytest.mark.parametrize("transform", ["unscented", "jacobian"])
 def test_alone_it_is_the_kalman_filter_of_robot_and_target(transform: str) -> None:
     subject = model(transform)
-    state = subject.initial()
+    state = subject.tracks.initial()
     library = KalmanFilter(dim_x=6, dim_z=2)
     library.x = state.mean[[0, 1, 3, 4, 5, 6], None].copy()
     library.P = np.diag([0.3, 0.2, 1.0, 1.0, 1.0, 1.0])
@@ -70,7 +70,7 @@ def test_alone_it_is_the_kalman_filter_of_robot_and_target(transform: str) -> No
 
 def test_own_noise_is_private_and_what_all_know_of_a_target_is_shared() -> None:
     subject = model("unscented")
-    state = subject.moved(subject.initial(), NS, STEP, NOISE)
+    state = subject.moved(subject.tracks.initial(), NS, STEP, NOISE)
     assert not state.split.private[3:].any()
     assert not state.split.shared[:3].any()
     assert np.linalg.eigvalsh(state.split.private)[-1] > 0.2
@@ -80,9 +80,9 @@ def test_own_noise_is_private_and_what_all_know_of_a_target_is_shared() -> None:
 def test_tracks_are_told_and_found_by_name() -> None:
     """Robots that track different targets, or in another order, share what both have."""
     mine, theirs = model("unscented", ("t1", "t2", "t3")), model("unscented", ("t3", "t1"))
-    told = theirs.snapshot(theirs.initial(), ("t3", "t1"))
-    state = mine.initial()
-    assert mine._layout.common(told) == [(slice(11, 15), slice(3, 7)), (slice(3, 7), slice(7, 11))]
+    told = theirs.snapshot(theirs.tracks.initial(), ("t3", "t1"))
+    state = mine.tracks.initial()
+    assert mine._layout(state).common(told) == [(slice(11, 15), slice(3, 7)), (slice(3, 7), slice(7, 11))]
     only = mine.snapshot(state, ("t2",))
     assert only.targets == (("t2", "constant_velocity"),)
     assert np.array_equal(only.mean, np.concatenate([state.mean[:3], state.mean[7:11]]))
@@ -98,7 +98,7 @@ def test_an_innovation_beyond_the_cap_counts_less() -> None:
     )
     found = absolute_model("position", settings.layout, settings.mean[:2] + 30.0, 0.01 * np.eye(2))
     assert found is not None
-    free = model("unscented").absolute(model("unscented").initial(), *found)
-    used = capped.absolute(capped.initial(), *found)
+    free = model("unscented").absolute(model("unscented").tracks.initial(), *found)
+    used = capped.absolute(capped.tracks.initial(), *found)
     assert used.nis > 9.0
     assert np.trace(used.state.cov[:2, :2]) > 2.0 * np.trace(free.state.cov[:2, :2])

@@ -44,6 +44,7 @@ from network.messages import (
     SplitReply,
     SplitRequest,
     SplitSnapshot,
+    StartRequest,
     TargetBelief,
     TeamReport,
 )
@@ -63,7 +64,7 @@ def example_snapshot() -> Snapshot:
         factor=np.arange(9.0).reshape(3, 3) / 16,
         line=EYE + 0.125,
         lines=(Line(Epoch(500, "r1", 4), 0.5 * EYE),),
-        targets=(TargetBelief("t1", Belief("constant_velocity", np.arange(4.0), np.eye(4) * 2)),),
+        targets=(TargetBelief("t1", Belief("constant_velocity", np.arange(4.0), np.eye(4) * 2), 600),),
     )
 
 
@@ -94,7 +95,9 @@ def example_split(private: bool = True) -> SplitSnapshot:
     cov = np.diag([0.25, 0.5, 0.01, 2.0, 2.0, 1.0, 1.0])
     cov[0, 3] = cov[3, 0] = 0.125
     own = np.diag([0.125, 0.25, 0.005, 0.0, 0.0, 0.0, 0.0]) if private else None
-    return SplitSnapshot("unicycle", (("t1", "constant_velocity"),), np.arange(7.0) / 4, cov, own)
+    relayed = (TargetBelief("t2", Belief("unicycle", np.array([8.0, 4.0, 2.0]), np.diag([4.0, 4.0, 1.0])), 900),)
+    targets = (("t1", "constant_velocity"),)
+    return SplitSnapshot("unicycle", targets, np.arange(7.0) / 4, cov, own, (300,), relayed if private else ())
 
 
 def example_report() -> TeamReport:
@@ -150,6 +153,7 @@ EXAMPLES: dict[str, Body] = {
     "team_report": example_report(),
     "joint_request": PairRequest(Epoch(1_000, "r1", 9), example_request().measurements, example_joint()),
     "joint_reply": PairReply(Epoch(1_000, "r2", 9), ReplyStatus.OK, example_joint(met=False)),
+    "start_request": StartRequest(Epoch(1000, "r1", 9)),
 }
 
 
@@ -218,7 +222,7 @@ def snapshots(draw: st.DrawFn) -> Snapshot:
         factor=draw(arrays(n, draw(st.integers(0, 4)))),
         line=draw(arrays(n, n)),
         lines=tuple(Line(epoch, draw(arrays(n, n))) for epoch in line_epochs),
-        targets=tuple(TargetBelief(target, draw(beliefs())) for target in target_ids),
+        targets=tuple(TargetBelief(target, draw(beliefs()), draw(stamps)) for target in target_ids),
         known=draw(st.booleans()),
     )
 
@@ -272,7 +276,12 @@ def split_snapshots(draw: st.DrawFn) -> SplitSnapshot:
     model, targets, n = draw(robots_and_targets())
     share = draw(st.one_of(st.none(), st.floats(0.0, 1.0)))
     cov = draw(covariances(n))
-    return SplitSnapshot(model, targets, draw(arrays(n)), cov, None if share is None else share * cov)
+    names = {name for name, _ in targets}
+    others = [name for name in draw(st.lists(ids, max_size=2, unique=True)) if name not in names]
+    relayed = tuple(TargetBelief(name, draw(beliefs()), draw(stamps)) for name in others)
+    ages_ns = tuple(draw(stamps) for _ in targets)
+    private = None if share is None else share * cov
+    return SplitSnapshot(model, targets, draw(arrays(n)), cov, private, ages_ns, relayed)
 
 
 @st.composite
@@ -559,6 +568,14 @@ SPOILED = {
     "a line cut short": (put("pair_reply", (2, 2, 4), doubles(1.0)), "malformed"),
     "too many lines": (put("pair_reply", (2, 2, 5), [0] * (MAX_LINES + 1)), "out_of_range"),
     "a bad target id": (put("pair_reply", (2, 2, 6, 0, 0), "T/1"), "bad_id"),
+    "a target learnt of in the future": (put("pair_reply", (2, 2, 6, 0, 5), -1), "out_of_range"),
+    "a target both in the belief and relayed": (put("split_request", (2, 2, 6, 0, 0), "t1"), "malformed"),
+    "a relayed belief cut short": (put("split_request", (2, 2, 6, 0, 3), doubles(1.0)), "malformed"),
+    "a joint target learnt of at no time": (put("split_reply", (2, 1, 5, 0), None), "wrong_type"),
+    "fewer ages than targets": (put("split_reply", (2, 1, 5), []), "malformed"),
+    "a start asked for in another's name": (put("start_request", (2, 0, 1), "r7"), "source_mismatch"),
+    "a start of no instant": (put("start_request", (2, 0), [0, "", 0]), "out_of_range"),
+    "a start with more": (put("start_request", (2,), [[1000, "r1", 9], 1]), "malformed"),
     "known as a number": (put("pair_reply", (2, 2, 7), 1), "wrong_type"),
     "a split of a robot nobody knows": (put("split_reply", (2, 1, 0), "hovercraft"), "unknown_model"),
     "a target of a model nobody knows": (put("split_reply", (2, 1, 1, 0, 1), "hovercraft"), "unknown_model"),

@@ -133,3 +133,25 @@ def test_the_world_of_a_recording_that_is_not_there_is_refused_in_one_line() -> 
     made = load("utias-all", ["world.path=/nowhere/at/all"])
     with pytest.raises(ConfigError, match=r"utias-all: world\.path: .*no such folder"):
         open_world(made, 1)
+
+
+def test_a_target_nobody_knew_of_is_in_the_bound_once_somebody_has_seen_it() -> None:
+    """Alone, a robot's own filter is the centralized one, also of a track that starts."""
+    target = {
+        "id": "t1",
+        "model": "constant_velocity",
+        "prior": False,
+        "start": {"pose": [9.0, 1.0, -0.2, 0.1]},
+        "start_sigma": {"velocity_mps": 0.3},
+        "noise": {"acceleration_mps2": 0.02},
+    }
+    sensors = {"eye": {"kind": "vector", "of": ["targets"], "sigma_m": 0.2, "max_range_m": 8.0}}
+    made = alone(sensors, targets=[target])
+    trace = run_trial(made, 3, with_bound=True).trace
+    assert trace.bound is not None
+    best, own = trace.bound["targets"]["t1"], trace.targets["t1"]["r1"]
+    assert not np.isfinite(best.mean[0]).any() and np.isfinite(best.mean[-1]).all()
+    np.testing.assert_array_equal(np.isnan(best.mean), np.isnan(own.mean))
+    started = np.isfinite(best.mean).all(axis=1)
+    np.testing.assert_allclose(best.mean[started][0], own.mean[started][0], atol=1e-9)
+    np.testing.assert_allclose(best.cov[started][0], own.cov[started][0], atol=1e-9)

@@ -90,6 +90,16 @@ def ratios(found: list[tuple[Array, Array]]) -> list[float]:
     return [float(e @ np.linalg.inv(P) @ e) / len(e) for e, P in found]
 
 
+def test_a_belief_that_comes_late_or_never_tells_when_it_started() -> None:
+    late, never = trial(1), trial(2)
+    never.targets["t1"]["r2"].mean[:] = np.nan
+    tracks = summarize([late, never], WINDOW, LOST_M)["targets"]["t1"]
+    assert (tracks["r1"]["started_s"], tracks["r2"]["started_s"]) == (30.0, 0.0)
+    assert tracks["r1"]["known_share"] == pytest.approx(31 / 51)
+    assert tracks["r2"]["known_share"] == 0.5
+    assert summarize([never], WINDOW, LOST_M)["targets"]["t1"]["r2"]["started_s"] is None
+
+
 def test_figures_are_what_plain_loops_give() -> None:
     traces = [trial(seed) for seed in range(5)]
     summary = summarize(traces, WINDOW, LOST_M)
@@ -104,6 +114,8 @@ def test_figures_are_what_plain_loops_give() -> None:
         assert entry["position_rmse_m"] == pytest.approx(rms([math.hypot(e[0], e[1]) for e, _ in found]))
         assert entry["heading_rmse_rad"] == pytest.approx(rms([e[2] for e, _ in found]))
         assert entry["position_error_max_m"] == pytest.approx(max(math.hypot(e[0], e[1]) for e, _ in found))
+        assert entry["known_share"] == pytest.approx(len(found) / (51 * len(traces)))
+        assert entry["started_s"] == 0.0
         last = [math.hypot(*errors(t.robots[name])[-1, :2]) for t in traces]
         assert entry["final_position_error_m"] == pytest.approx(statistics.median(last))
         assert entry["anees"] == pytest.approx(statistics.fmean(ratios(found)))
@@ -125,7 +137,7 @@ def test_figures_are_what_plain_loops_give() -> None:
         entry = summary["targets"]["t1"][name]
         assert set(entry) == {
             "dof", "position_rmse_m", "velocity_rmse_mps", "anees", "containment_3sigma",
-            "error_min", "error_max", "error_worst",
+            "error_min", "error_max", "error_worst", "started_s", "known_share",
         }  # fmt: skip
         for index, key in enumerate(("x_m", "y_m", "vx_mps", "vy_mps")):
             largest = [max(abs(e[index]) for e, _ in items) for items in own]

@@ -113,6 +113,8 @@ MISTAKES: list[tuple[str, list[str]]] = [
     ("robots.r2.localization.form=bad", ["robots.r2.localization", "'form' = 'bad'", "'published' or 'joint'"]),
     ("localization={form='joint',correlation='ignored'}", ["'ignored'", "add form = 'published' or 'safe'"]),
     ("localization={form='split_joint',correlation='ignored'}", ["'ignored'", "add form ="]),
+    ("robots.r2.start_source=fix", ["robots.r2.start_source = 'fix'", "a position fix", "nor a heading fix"]),
+    ("robots.r2.start_source=peer", ["robots.r2.start_source = 'peer'", "or a sensor of peers (bearing"]),
     ("links.loss=abc", ["'links.loss' = 'abc'", "number"]),
     ("links.loss=true", ["'links.loss' = True", "number"]),
     ("links.loss=1.5", ["'links.loss' = 1.5", "less than or equal to 1"]),
@@ -191,6 +193,15 @@ def test_a_mistake_is_answered_with_the_key_and_the_remedy(override: str, words:
     line = complaint(override)
     for word in words:
         assert word in line
+
+
+def test_the_joint_form_has_the_same_tracks_all_the_time() -> None:
+    joint = "localization.form=joint"
+    for override in ("targets.t1.prior=false", "tracking.end_above_m=5.0", "robots.r1.start_source=fix"):
+        with pytest.raises(ConfigError, match="form = 'joint'"):
+            load("ut-clat", [joint, override])
+    load("ut-clat", [joint, "targets.t1.prior=false", "tracking.kind=none"])
+    load("ut-clat", ["targets.t1.prior=false", "tracking.end_above_m=5.0", "robots.r1.start_source=fix"])
 
 
 def test_an_unknown_scenario_is_answered_with_the_nearest_name() -> None:

@@ -120,3 +120,30 @@ def test_the_joint_covariance_stays_symmetric_and_positive_definite(transform: T
             subject.observe(name, "range", of, np.array([distance + rng.normal() * 0.02]), np.array([[4e-4]]))
         assert np.array_equal(subject.cov, subject.cov.T)
         np.linalg.cholesky(subject.cov)
+
+
+def test_a_target_nobody_knew_of_joins_correlated_with_everybody() -> None:
+    """As in the limit of an ever wider prior, when headings are known and a vector is seen."""
+    sure = {name: (mean, np.diag([0.3, 0.2, 1e-12]), motion) for name, (mean, _, motion) in ROBOTS.items()}
+    place, cov = np.array([0.0, 0.0, 0.8]), np.diag([0.0, 0.0, 0.05])
+    wide = np.diag([1e7, 1e7, 0.05])
+    ours = CentralizedFilter(sure, {}, {}, "jacobian", unseen={"t1": (place, cov, MOTION)})
+    limit = CentralizedFilter(sure, {"t1": (place, wide, MOTION)}, {}, "jacobian")
+    R = np.diag([0.1, 0.05])
+    assert "t1" not in ours
+    other = ours.copy()
+    for subject in (ours, limit):
+        subject.observe("r1", "vector", "r2", np.array([5.0, 1.0]), R)
+        subject.observe("r2", "vector", "target:t1", np.array([4.0, -1.5]), R)
+        subject.observe("r1", "vector", "target:t1", np.array([3.0, -4.0]), R)
+    assert "t1" in ours and "t1" not in other
+    np.testing.assert_allclose(ours.mean, limit.mean, atol=1e-5)
+    np.testing.assert_allclose(ours.cov, limit.cov, atol=1e-5)
+
+
+def test_a_range_alone_brings_in_a_target_only_within_a_stated_distance() -> None:
+    unseen = {"t1": (np.zeros(3), np.diag([0.0, 0.0, 0.05]), MOTION)}
+    for within_m, joins in ((None, False), (4.0, False), (6.0, True)):
+        subject = CentralizedFilter(ROBOTS, {}, {}, unseen=unseen, within_m=within_m)
+        subject.observe("r1", "range", "target:t1", np.array([5.0]), np.array([[0.01]]))
+        assert ("t1" in subject) is joins
