@@ -50,6 +50,8 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, frozenset):
+        return {"@": "frozenset", "items": sorted(value)}
     return value
 
 
@@ -63,6 +65,8 @@ def _object(value: Any) -> Any:
         return np.frombuffer(value["data"], "<f8").reshape(value["shape"]).copy()
     if name == "ReplyStatus":
         return message_types.ReplyStatus(value["value"])
+    if name == "frozenset":
+        return frozenset(value["items"])
     if name is None:
         return {key: _object(item) for key, item in value.items()}
     return _TYPES[name](**{key: _object(item) for key, item in value.items() if key != "@"})

@@ -14,7 +14,7 @@ from agent.effects import Send
 from agent.events import LinkChange, Observation, Odometry
 from agent.joint_filter import JointFilter
 from agent.joint_state import JointState
-from agent.settings import NS, LocalizationSettings, TargetSettings
+from agent.settings import NS, LocalizationSettings, TargetSettings, TrackEnd
 from network.messages import Epoch, JointSnapshot, PairReply, PairRequest, ReplyStatus, SplitRequest
 from tests.agent.team_story import (
     DELTA,
@@ -215,3 +215,24 @@ def test_measurements_that_keep_being_far_from_linear_are_a_reason_to_hand_over(
         reasons.append(group.agents["r1"].status()["form_reason"])
     assert reasons[0] == "at most 3 robots have met"
     assert reasons[-1] == "measurements keep being far from linear"
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"found_out": True}, "the robot has not started with the others"),
+        ({"track_end": TrackEnd(after_ns=NS)}, "tracks start or end"),
+        ({"targets": (TargetSettings("t1", MOTION, None, TARGET_COV),)}, "tracks start or end"),
+    ],
+)
+def test_who_starts_late_and_whose_tracks_come_and_go_keeps_no_factors(change: dict[str, object], why: str) -> None:
+    """And hands that on to whomever it meets."""
+    cov = np.diag([0.5, 0.5, 0.01])
+    other = replace(settings("r2", np.array(EVERYWHERE["r2"]), cov, TARGET, AUTO), **change)  # type: ignore[arg-type]
+    group = team("r1")
+    group.agents["r2"] = Agent(other)
+    assert forms(group) == {"r1": "joint", "r2": "split_joint"}
+    assert group.agents["r2"].status()["form_reason"] == why
+    step(group)
+    meet(group, "r1", "r2")
+    assert set(forms(group).values()) == {"split_joint"}
