@@ -37,6 +37,12 @@ RECURRING = 2e-3
 SAME_TARGET_M2 = 1e-4
 """Variance by which two robots' tracks are taken to be of one target."""
 
+CONTRADICTING = 9.0
+"""NIS per degree of freedom of a sighting that does not agree with a track."""
+
+CONTRADICTIONS = 3
+"""So many of them on end are the track's fault, not the sensor's."""
+
 NEGLIGIBLE = 1e-2
 """Residuals below this share of a measurement's variance do not recur noticeably."""
 
@@ -100,8 +106,26 @@ class JointModel:
             if again is not None:
                 state = self.tracks.without(state, {target})
                 return Used(self.tracks.started(state, target, again, state.t_ns), None)
+            if state.doubted.get(target, 0) >= CONTRADICTIONS:
+                state = self.tracks.without(state, {target})
+                return self._again(state, target, model, track, z, R)
         used = self._measured(state, model, z, R, self._layout(state).with_target(target), RESIDUAL_FACTOR)
-        return replace(used, state=learnt(used.state, {target: state.t_ns}))
+        state = self.tracks.judged(used.state, target, used.nis is None or used.nis <= CONTRADICTING)
+        return replace(used, state=learnt(state, {target: state.t_ns}))
+
+    def _again(
+        self, state: JointState, target: str, model: RelativeModel, was: tuple[Array, Array], z: Array, R: Array
+    ) -> Used:
+        """Begin the track of a target anew whose belief `was` has been contradicted on end: it was on a wrong side."""
+        own, rules = (state.mean[self._own], state.cov[self._own, self._own]), self.tracks.rules
+        start = rules.started(target, model, own, state.t_ns, z, R)
+        if start is not None:
+            return Used(self.tracks.started(state, target, start, state.t_ns), None)
+        apart = float(np.hypot(*(was[0][:2] - own[0][:2])))
+        start = rules.started_vaguely(target, model, own, state.t_ns, z, R, 2.0 * max(apart, float(z[0])))
+        if start is None:
+            return Used(state, None)
+        return Used(self.tracks.beside(state, target, start.mean, start.cov(own[1])), None)
 
     def _beside(
         self, state: JointState, target: str, model: RelativeModel, z: Array, R: Array

@@ -50,8 +50,8 @@ class RelayedTrack:
 class JointState:
     """mean (n,) and split covariance (n, n) of the robot followed by `tracks`, at `t_ns`; and relayed tracks.
 
-    `learnt_ns`: when something was last learnt of each track, by a sighting of whoever told of it. The dictionary is
-    never changed.
+    `learnt_ns`: when something was last learnt of each track, by a sighting of whoever told of it. `doubted`: how many
+    own sightings on end have contradicted a track, where any has. The dictionaries are never changed.
     """
 
     t_ns: int
@@ -60,6 +60,7 @@ class JointState:
     tracks: tuple[str, ...]
     learnt_ns: tuple[int, ...]
     relayed: dict[str, RelayedTrack] = field(default_factory=dict)
+    doubted: dict[str, int] = field(default_factory=dict)
 
     @property
     def cov(self) -> Array:
@@ -122,6 +123,7 @@ class JointTracks:
             (*state.tracks, target),
             (*state.learnt_ns, learnt_ns),
             {name: track for name, track in state.relayed.items() if name != target},
+            state.doubted,
         )
 
     def beside(self, state: JointState, target: str, mean: Array, cov: Array) -> JointState:
@@ -144,7 +146,17 @@ class JointTracks:
             split=Split(state.split.private[square], state.split.shared[square]),
             tracks=tuple(state.tracks[index] for index in kept),
             learnt_ns=tuple(state.learnt_ns[index] for index in kept),
+            doubted={name: count for name, count in state.doubted.items() if name not in gone},
         )
+
+    def judged(self, state: JointState, target: str, agrees: bool) -> JointState:
+        """The state after an own sighting agreed with the track of a target, or contradicted it."""
+        if agrees and target not in state.doubted:
+            return state
+        doubted = {name: count for name, count in state.doubted.items() if name != target}
+        if not agrees:
+            doubted[target] = state.doubted.get(target, 0) + 1
+        return replace(state, doubted=doubted)
 
     def aged(self, state: JointState, dt_s: float) -> JointState:
         """A joint belief that has been moved by `dt_s` to `t_ns`: relayed tracks follow, and those that are over go."""

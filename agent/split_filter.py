@@ -25,7 +25,7 @@ from agent.estimation.observation import (
 )
 from agent.events import LinkChange, Observation, Received
 from agent.joint_history import JointHistory, Learnt
-from agent.joint_state import JointModel, Used
+from agent.joint_state import CONTRADICTIONS, JointModel, Used
 from agent.joint_tracks import JointState
 from agent.pair_clock import PairClocks
 from agent.settings import AgentSettings
@@ -173,6 +173,8 @@ class SplitFilter:
             # Kept all the same: a sighting that comes late may have started the track before.
             self._counters["track.undetermined"] += 1
             return
+        if then.doubted.get(target, 0) >= CONTRADICTIONS:
+            self._counters["track.contradicted"] += 1
         if late:
             self._counters["late.target_compensated"] += 1
         self._counters["used.sighting"] += 1

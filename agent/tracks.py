@@ -58,12 +58,14 @@ class TrackRules:
         t_ns: int,
         z: Array,
         R: Array,
+        within_m: float | None = None,
     ) -> TrackStart | None:
-        """The same from a bearing or a range alone, if the settings say how far off a target can be."""
-        if self._within_m is None:
+        """The same from a bearing or a range alone, if `within_m` or the settings say how far off a target can be."""
+        within_m = self._within_m if within_m is None else within_m
+        if within_m is None:
             return None
         rest = self._rest(self._targets[target], t_ns)
-        found = start_vaguely(model, own, rest, z, R, self._within_m, self._parameters)
+        found = start_vaguely(model, own, rest, z, R, within_m, self._parameters)
         return None if found is None or self.ended(target, found.cov(own[1]), t_ns, t_ns) else found
 
     def begun_again(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
@@ -9,7 +11,9 @@ from numpy.typing import NDArray
 
 from agent.estimation.motion import CONSTANT_VELOCITY, TargetMotion
 from agent.estimation.observation import RelativeModel, absolute_model
-from agent.joint_state import JointModel
+from agent.estimation.split_joint import Split
+from agent.joint_state import CONTRADICTIONS, JointModel
+from agent.joint_tracks import JointState
 from agent.settings import NS, AgentSettings, LocalizationSettings, TargetSettings
 
 Array = NDArray[np.float64]
@@ -102,3 +106,56 @@ def test_an_innovation_beyond_the_cap_counts_less() -> None:
     used = capped.absolute(capped.tracks.initial(), *found)
     assert used.nis > 9.0
     assert np.trace(used.state.cov[:2, :2]) > 2.0 * np.trace(free.state.cov[:2, :2])
+
+
+def on_a_wrong_side(kind: str) -> tuple[JointModel, list[JointState]]:
+    """Sightings of a target that is at (-4, 2) while the track is sure that it is at (4, 3); states after each."""
+    subject = model("unscented")
+    state = subject.tracks.initial()
+    cov = state.cov.copy()
+    cov[3:, 3:] *= 0.01
+    state = replace(state, mean=state.mean.copy(), split=Split(np.zeros_like(cov), cov))
+    sensor = RelativeModel(kind, subject._settings.layout, subject=CONSTANT_VELOCITY)
+    states = [state]
+    for k in range(1, 12):
+        state = subject.moved(state, k * NS, STEP, NOISE)
+        truth = np.concatenate([state.mean[:3], [-4.0, 2.0, 0.0, 0.0]])
+        z = sensor.h(truth)
+        state = subject.sighting(state, "t1", sensor, z, 0.01 * np.eye(len(z))).state
+        states.append(state)
+    return subject, states
+
+
+@pytest.mark.parametrize("kind", ["vector", "range_bearing"])
+def test_a_track_that_is_contradicted_on_end_begins_again_where_the_target_is(kind: str) -> None:
+    _, states = on_a_wrong_side(kind)
+    (block,) = model("unscented").tracks.blocks(states[-1])
+    error = states[-1].mean[block][:2] - np.array([-4.0, 2.0])
+    cov = states[-1].cov[block, block][:2, :2]
+    assert float(error @ np.linalg.solve(cov, error)) / 2.0 < 3.0
+    assert np.hypot(*error) < 0.5
+    assert states[CONTRADICTIONS].doubted == {"t1": CONTRADICTIONS}
+    assert states[-1].doubted == {}
+
+
+def test_where_a_sighting_tells_no_place_a_contradicted_track_stays_beside_the_joint_belief() -> None:
+    subject = model("unscented")
+    state = replace(subject.tracks.initial(), doubted={"t1": CONTRADICTIONS})
+    sensor = RelativeModel("range", subject._settings.layout, subject=CONSTANT_VELOCITY)
+    place = np.array([-4.0, 2.0])
+    z = sensor.h(np.concatenate([state.mean[:3], place, [0.0, 0.0]]))
+    after = subject.sighting(state, "t1", sensor, z, 0.01 * np.eye(1)).state
+    assert after.tracks == () and np.array_equal(after.mean, state.mean[:3])
+    track = after.relayed["t1"]
+    error = track.mean[:2] - place
+    assert float(error @ np.linalg.solve(track.cov[:2, :2], error)) / 2.0 < 1.5
+
+
+def test_one_outlier_is_the_sensors_fault() -> None:
+    subject = model("unscented")
+    state = subject.moved(subject.tracks.initial(), NS, STEP, NOISE)
+    sensor = RelativeModel("vector", subject._settings.layout, subject=CONSTANT_VELOCITY)
+    clean = sensor.h(state.mean)
+    for off in (50.0, 0.0, 50.0, 0.0, 50.0, 0.0):
+        state = subject.sighting(state, "t1", sensor, clean + off, 0.01 * np.eye(2)).state
+    assert state.tracks == ("t1",)
