@@ -79,7 +79,9 @@ def overlapping(noise: tuple[str, ...], column: int, size: float) -> Fleet:
     for name, place in PLACES.items():
         off = size * np.linalg.cholesky(COVS[name])[:, column] if noise == ("start", name) else np.zeros(3)
         starts[name] = (place + off, COVS[name])
-    localization = LocalizationSettings(transform="jacobian", pair_interval_ns=0, pair_timeout_ns=100 * NS)
+    localization = LocalizationSettings(
+        form="split_joint", transform="jacobian", pair_interval_ns=0, pair_timeout_ns=100 * NS
+    )
     fleet = Fleet(starts, localization, ONE_WAY)
     truth = {name: [place] for name, place in PLACES.items()}
 
@@ -142,7 +144,7 @@ def test_a_dense_fleet_far_behind_stays_where_it_is() -> None:
     P = np.diag([0.25, 0.25, 0.0025])
     truth = {name: rng.uniform([-10, -10, -3], [10, 10, 3]) for name in names}
     starts = {name: (truth[name] + rng.multivariate_normal(np.zeros(3), P), P) for name in names}
-    fleet = Fleet(starts, LocalizationSettings(pair_timeout_ns=100 * NS), dict.fromkeys(names, NS))
+    fleet = Fleet(starts, LocalizationSettings(form="split_joint", pair_timeout_ns=100 * NS), dict.fromkeys(names, NS))
     squares = []
     for k in range(1, 201):
         now_ns = k * step_ns

@@ -57,7 +57,7 @@ def test_parts_overridden_for_one_robot_reach_it_alone() -> None:
         "robots.r3.sensors.range.two_way=false",
     )
     forms = {name: config.localization.form for name, config in configs.items()}
-    assert forms == {"r1": "split_joint", "r2": "published", "r3": "split_joint", "r4": "split_joint"}
+    assert forms == {"r1": "auto", "r2": "published", "r3": "auto", "r4": "auto"}
     assert [config.lateness.kind for config in configs.values()] == [
         "compensate",
         "compensate",
