@@ -7,7 +7,6 @@ row. Everything is validated before a value is handed on: a decoded message sati
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable
 from itertools import pairwise
@@ -18,13 +17,9 @@ import numpy as np
 
 from network.messages import (
     MAX_ECHOES,
-    MAX_GROUP,
     MAX_JOINT_DIM,
-    MAX_LINES,
     MAX_MEASUREMENTS,
     MAX_MESSAGE_BYTES,
-    MAX_STATE_DIM,
-    MAX_TARGETS,
     SCHEMA,
     Body,
     ClockEcho,
@@ -32,47 +27,35 @@ from network.messages import (
     Header,
     Hello,
     JointSnapshot,
-    Line,
     Measurement,
     Message,
     PairReply,
     PairRequest,
     ReplyStatus,
-    Snapshot,
     SplitReply,
     SplitRequest,
-    SplitSnapshot,
     StartRequest,
-    TargetBelief,
     TeamReport,
 )
 from network.wire_fields import (
-    BELIEF_FLOOR,
-    FULL,
-    MAX_ABS,
     WireError,
-    checked_cov,
-    is_part,
-    pack_array,
-    pack_belief,
-    pack_cov,
     pack_epoch,
     pack_measurement,
-    pack_single,
-    read_array,
-    read_belief,
     read_contact,
-    read_cov,
-    read_dim,
-    read_epoch,
     read_fields,
     read_id,
     read_integer,
     read_items,
     read_measurement,
-    read_single,
-    read_single_or_none,
     read_text,
+)
+from network.wire_snapshots import (
+    pack_joint,
+    pack_snapshot,
+    pack_split,
+    read_joint,
+    read_snapshot,
+    read_split,
 )
 from network.wire_team import pack_report, read_report
 
@@ -91,7 +74,6 @@ _LIMITS: dict[str, Any] = {
     "max_map_len": 0,
     "max_ext_len": 0,
 }
-
 
 
 class OversizeError(ValueError):
@@ -145,78 +127,23 @@ def _pack_body(body: Body) -> tuple[int, tuple[Any, ...]]:
         measurements = tuple(pack_measurement(m) for m in body.measurements)
         epoch = pack_epoch(body.epoch)
         if isinstance(body.snapshot, JointSnapshot):
-            return _JOINT_REQUEST, (epoch, measurements, _pack_joint(body.snapshot))
-        return _PAIR_REQUEST, (epoch, measurements, _pack_snapshot(body.snapshot))
+            return _JOINT_REQUEST, (epoch, measurements, pack_joint(body.snapshot))
+        return _PAIR_REQUEST, (epoch, measurements, pack_snapshot(body.snapshot))
     if isinstance(body, PairReply):
         if isinstance(body.snapshot, JointSnapshot):
-            return _JOINT_REPLY, (pack_epoch(body.epoch), _pack_joint(body.snapshot))
-        snapshot = None if body.snapshot is None else _pack_snapshot(body.snapshot)
+            return _JOINT_REPLY, (pack_epoch(body.epoch), pack_joint(body.snapshot))
+        snapshot = None if body.snapshot is None else pack_snapshot(body.snapshot)
         return _PAIR_REPLY, (pack_epoch(body.epoch), int(body.status), snapshot)
     if isinstance(body, SplitRequest):
         measurements = tuple(pack_measurement(m) for m in body.measurements)
-        return _SPLIT_REQUEST, (pack_epoch(body.epoch), measurements, _pack_split(body.snapshot))
+        return _SPLIT_REQUEST, (pack_epoch(body.epoch), measurements, pack_split(body.snapshot))
     if isinstance(body, SplitReply):
-        return _SPLIT_REPLY, (pack_epoch(body.epoch), _pack_split(body.snapshot))
+        return _SPLIT_REPLY, (pack_epoch(body.epoch), pack_split(body.snapshot))
     if isinstance(body, TeamReport):
         return _TEAM_REPORT, pack_report(body)
     if isinstance(body, StartRequest):
         return _START_REQUEST, (pack_epoch(body.epoch),)
     raise TypeError(f"{type(body).__name__} is not a message body")
-
-
-def _pack_snapshot(snapshot: Snapshot) -> tuple[Any, ...]:
-    n = len(snapshot.belief.mean)
-    columns = snapshot.factor.shape[-1]
-    return (
-        pack_belief(snapshot.belief),
-        pack_epoch(snapshot.base),
-        columns,
-        pack_array(snapshot.factor, (n, columns)),
-        pack_array(snapshot.line, (n, n)),
-        tuple((pack_epoch(line.epoch), pack_array(line.matrix, (n, n))) for line in snapshot.lines),
-        tuple(_pack_target(target) for target in snapshot.targets),
-        snapshot.known,
-    )
-
-
-def _pack_target(target: TargetBelief) -> tuple[Any, ...]:
-    return (target.target, *pack_belief(target.belief), target.age_ns)
-
-
-def _pack_split(snapshot: SplitSnapshot) -> tuple[Any, ...]:
-    n = len(snapshot.mean)
-    return (
-        snapshot.model,
-        snapshot.targets,
-        pack_array(snapshot.mean, (n,)),
-        pack_cov(snapshot.cov, n),
-        None if snapshot.private is None else pack_cov(snapshot.private, n),
-        snapshot.ages_ns,
-        tuple(_pack_target(target) for target in snapshot.relayed),
-    )
-
-
-def _pack_joint(snapshot: JointSnapshot) -> tuple[Any, ...]:
-    n = len(snapshot.mean)
-    c = n - read_dim(snapshot.model)
-    columns = 0 if snapshot.factor is None else snapshot.factor.shape[-1]
-    return (
-        snapshot.model,
-        snapshot.targets,
-        pack_array(snapshot.mean, (n,)),
-        pack_cov(snapshot.cov, n, "<f4"),
-        pack_epoch(snapshot.base),
-        columns,
-        pack_single(snapshot.factor, (n, columns)),
-        pack_single(snapshot.line, (n, n)),
-        pack_single(snapshot.noise, (n, c)),
-        pack_single(snapshot.prior, (n, c)),
-        float(snapshot.span_s),
-        tuple((pack_epoch(line.epoch), pack_single(line.matrix, line.matrix.shape)) for line in snapshot.lines),
-        snapshot.known,
-        snapshot.anew,
-        None if snapshot.group is None else tuple(sorted(snapshot.group)),
-    )
 
 
 # --- decoding ---------------------------------------------------------------------------------------------
@@ -283,40 +210,6 @@ def _header(raw: Any) -> Header:
     )
 
 
-def _line(raw: Any, n: int) -> Line:
-    epoch, matrix = read_fields(raw, 2)
-    return Line(read_contact(epoch), read_array(matrix, n * n).reshape(n, n))
-
-
-def _target(raw: Any) -> TargetBelief:
-    fields = read_fields(raw, 6)
-    return TargetBelief(read_id(fields[0]), read_belief(fields[1:5]), read_integer(fields[5]))
-
-
-def _snapshot(raw: Any) -> Snapshot:
-    belief_raw, base, columns, factor, line, lines_raw, targets_raw, known = read_fields(raw, 8)
-    belief = read_belief(belief_raw)
-    n = len(belief.mean)
-    m = read_integer(columns, MAX_STATE_DIM)
-    lines = tuple(_line(item, n) for item in read_items(lines_raw, MAX_LINES))
-    if any(later.epoch <= earlier.epoch for earlier, later in pairwise(lines)):
-        raise WireError("malformed")
-    targets = tuple(_target(item) for item in read_items(targets_raw, MAX_TARGETS))
-    if len({target.target for target in targets}) != len(targets):
-        raise WireError("malformed")
-    if type(known) is not bool:
-        raise WireError("wrong_type")
-    return Snapshot(
-        belief=belief,
-        base=read_epoch(base),
-        factor=read_array(factor, n * m).reshape(n, m),
-        line=read_array(line, n * n).reshape(n, n),
-        lines=lines,
-        targets=targets,
-        known=known,
-    )
-
-
 def _hello(raw: Any, header: Header) -> Hello:
     software, echoes_raw = read_fields(raw, 2)
     if _SOFTWARE(read_text(software)) is None:
@@ -344,7 +237,7 @@ def _opened(raw: Any, header: Header) -> tuple[Epoch, tuple[Measurement, ...], A
 
 def _pair_request(raw: Any, header: Header) -> PairRequest:
     epoch, measurements, snapshot = _opened(raw, header)
-    return PairRequest(epoch, measurements, _snapshot(snapshot))
+    return PairRequest(epoch, measurements, read_snapshot(snapshot))
 
 
 def _pair_reply(raw: Any, header: Header) -> PairReply:
@@ -354,103 +247,28 @@ def _pair_reply(raw: Any, header: Header) -> PairReply:
         raise WireError("out_of_range")
     if (snapshot_raw is not None) != (status == ReplyStatus.OK):
         raise WireError("malformed")
-    snapshot = None if snapshot_raw is None else _snapshot(snapshot_raw)
+    snapshot = None if snapshot_raw is None else read_snapshot(snapshot_raw)
     return PairReply(read_contact(epoch), ReplyStatus(status), snapshot)
-
-
-def _robot_and_targets(model: Any, targets_raw: Any) -> tuple[tuple[tuple[str, str], ...], int, int]:
-    """Targets (id, model) of a joint belief, its size and that of the targets together."""
-    targets = []
-    for item in read_items(targets_raw, MAX_TARGETS):
-        name, target_model = read_fields(item, 2)
-        targets.append((read_id(name), read_text(target_model)))
-    if len({name for name, _ in targets}) != len(targets):
-        raise WireError("malformed")
-    c = sum(read_dim(target_model) for _, target_model in targets)
-    n = read_dim(model) + c
-    if n > MAX_JOINT_DIM:
-        raise WireError("out_of_range")
-    return tuple(targets), n, c
-
-
-def _split(raw: Any) -> SplitSnapshot:
-    model, targets_raw, mean, cov_raw, private_raw, ages_raw, relayed_raw = read_fields(raw, 7)
-    targets, n, _ = _robot_and_targets(model, targets_raw)
-    ages_ns = tuple(read_integer(item) for item in read_items(ages_raw, MAX_TARGETS))
-    relayed = tuple(_target(item) for item in read_items(relayed_raw, MAX_TARGETS))
-    names = {name for name, _ in targets} | {item.target for item in relayed}
-    if len(ages_ns) != len(targets) or len(names) != len(targets) + len(relayed):
-        raise WireError("malformed")
-    cov = read_cov(cov_raw, n, BELIEF_FLOOR, "not_positive_definite")
-    private = None
-    if private_raw is not None:
-        private = read_array(private_raw, n * (n + 1) // 2)[FULL[n]]
-        if not is_part(private, cov):
-            raise WireError("not_positive_definite")
-    return SplitSnapshot(model, targets, read_array(mean, n), cov, private, ages_ns, relayed)
-
-
-def _joint(raw: Any) -> JointSnapshot:
-    fields = read_fields(raw, 15)
-    model, targets_raw, mean, cov, base, columns, factor, line, noise, prior, span_s = fields[:11]
-    lines_raw, known, anew, group = fields[11:]
-    targets, n, c = _robot_and_targets(model, targets_raw)
-    m = read_integer(columns, MAX_JOINT_DIM)
-    if type(known) is not bool or type(anew) is not bool or type(span_s) is not float:
-        raise WireError("wrong_type")
-    if not 0.0 <= span_s <= MAX_ABS:
-        raise WireError("out_of_range" if math.isfinite(span_s) else "non_finite")
-    lines = []
-    for item in read_items(lines_raw, MAX_LINES):
-        epoch, matrix = read_fields(item, 2)
-        wide = type(matrix) is bytes and len(matrix) > 4 * n * n
-        lines.append(Line(read_contact(epoch), read_single(matrix, n, n + c if wide else n)))
-    if any(later.epoch <= earlier.epoch for earlier, later in pairwise(lines)):
-        raise WireError("malformed")
-    packed = read_single(cov, n * (n + 1) // 2)
-    return JointSnapshot(
-        model=model,
-        targets=targets,
-        mean=read_array(mean, n),
-        cov=checked_cov(packed, n, BELIEF_FLOOR, "not_positive_definite"),
-        base=read_epoch(base),
-        factor=read_single_or_none(factor, n, m),
-        line=read_single_or_none(line, n, n),
-        noise=read_single_or_none(noise, n, c),
-        prior=read_single_or_none(prior, n, c),
-        span_s=span_s,
-        lines=tuple(lines),
-        known=known,
-        anew=anew,
-        group=None if group is None else _group(group),
-    )
-
-
-def _group(raw: Any) -> frozenset[str]:
-    names = [read_id(item) for item in read_items(raw, MAX_GROUP)]
-    if any(later <= earlier for earlier, later in pairwise(names)):
-        raise WireError("malformed")
-    return frozenset(names)
 
 
 def _split_request(raw: Any, header: Header) -> SplitRequest:
     epoch, measurements, snapshot = _opened(raw, header)
-    return SplitRequest(epoch, measurements, _split(snapshot))
+    return SplitRequest(epoch, measurements, read_split(snapshot))
 
 
 def _split_reply(raw: Any, header: Header) -> SplitReply:
     epoch, snapshot = read_fields(raw, 2)
-    return SplitReply(read_contact(epoch), _split(snapshot))
+    return SplitReply(read_contact(epoch), read_split(snapshot))
 
 
 def _joint_request(raw: Any, header: Header) -> PairRequest:
     epoch, measurements, snapshot = _opened(raw, header)
-    return PairRequest(epoch, measurements, _joint(snapshot))
+    return PairRequest(epoch, measurements, read_joint(snapshot))
 
 
 def _joint_reply(raw: Any, header: Header) -> PairReply:
     epoch, snapshot = read_fields(raw, 2)
-    return PairReply(read_contact(epoch), ReplyStatus.OK, _joint(snapshot))
+    return PairReply(read_contact(epoch), ReplyStatus.OK, read_joint(snapshot))
 
 
 def _start_request(raw: Any, header: Header) -> StartRequest:
