@@ -21,7 +21,7 @@ from typing import Any
 
 from agent.config_file import ConfigError
 from sim.metrics import combine
-from sim.scenario import load
+from sim.scenario_file import load
 from sim.summary import reduce
 from sim.trial import run_trial
 

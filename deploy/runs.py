@@ -28,7 +28,8 @@ from deploy.status import LiveTable, Progress, print_summary
 from network.links import FateRecord
 from sim.agents import agent_config, table
 from sim.engine import TrialResult
-from sim.scenario import Scenario, load
+from sim.scenario import Scenario
+from sim.scenario_file import load
 from sim.store import load_trace, save_trace
 from sim.summary import reduce, summarize, unmet
 from sim.trial import open_world, run_trial

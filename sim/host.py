@@ -28,7 +28,8 @@ from network.link_feed import LinkFeed
 from sim.agents import autopilot_fix
 from sim.autopilot import StandIn, StandInServer
 from sim.reach import Reach
-from sim.scenario import RobotPart, load
+from sim.scenario import RobotPart
+from sim.scenario_file import load
 from sim.trial import open_world
 from sim.vehicle_telemetry import StandInSettings
 from sim.world import Output, World

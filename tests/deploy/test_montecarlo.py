@@ -20,7 +20,7 @@ from deploy import montecarlo
 from deploy.cli import main, parser, usable_cores
 from deploy.status import TrialProgress, duration
 from sim.montecarlo import Pace, WorkerDied, Workers
-from sim.scenario import load
+from sim.scenario_file import load
 from sim.trial_store import FILE, TrialStore, records
 
 COFIX = (sys.executable, "-P", "-m", "deploy.cli")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from deploy.cli import parser
-from sim.scenario import bundled, load
+from sim.scenario_file import bundled, load
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))

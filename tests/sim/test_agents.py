@@ -11,7 +11,8 @@ import tomli_w
 from agent.config import load_agent_config
 from agent.estimation.observation import planar_mount
 from sim.agents import agent_config, agent_tables, odometry_table, table
-from sim.scenario import Scenario, load
+from sim.scenario import Scenario
+from sim.scenario_file import load
 from sim.trial import open_world
 from sim.world import control_odometry
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sim.montecarlo import run_trials
-from sim.scenario import load
+from sim.scenario_file import load
 from sim.summary import summarize
 
 SCENARIO = """

@@ -12,7 +12,8 @@ from agent.config_file import ConfigError
 from sim.bound import BoundRunner
 from sim.engine import TrialResult
 from sim.metrics import nees
-from sim.scenario import Scenario, load
+from sim.scenario import Scenario
+from sim.scenario_file import load
 from sim.trial import open_world, run_trial
 
 SHORT = ["duration_s=120", "window_s=[30, 120]"]

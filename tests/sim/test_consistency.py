@@ -14,7 +14,7 @@ import pytest
 from scipy import stats
 
 from sim.metrics import reduce_trial
-from sim.scenario import load
+from sim.scenario_file import load
 from sim.trial import run_trial
 
 SEEDS = range(1, 13)

@@ -16,7 +16,8 @@ from network.links import FateRecord, packet_fate
 from network.messages import Packet, PairReply, PairRequest, ReplyStatus, SplitReply, SplitRequest
 from sim.engine import TrialResult, VirtualEngine, network_figures, sample_stride
 from sim.metrics import StateTrace
-from sim.scenario import Scenario, check
+from sim.scenario import Scenario
+from sim.scenario_checks import check
 from sim.trial import open_world
 
 S = 1_000_000_000

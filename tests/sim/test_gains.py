@@ -9,7 +9,8 @@ import pytest
 from scipy import stats
 
 from sim.metrics import nees
-from sim.scenario import Scenario, load
+from sim.scenario import Scenario
+from sim.scenario_file import load
 from sim.trial import run_trial
 
 SEEDS = range(1, 9)

@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 
 from sim.metrics import trial_figures
 from sim.montecarlo import Pace, TrialError, WorkerDied, Workers, run_trials, write_trials
-from sim.scenario import Scenario, load
+from sim.scenario import Scenario
+from sim.scenario_file import load
 from sim.summary import NOT_COMPARED, reduce, summarize
 from sim.trial import run_trial
 

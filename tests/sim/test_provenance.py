@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sim.provenance import differences, provenance, summed_up
-from sim.scenario import load
+from sim.scenario_file import load
 
 BASE = provenance(load("ut-clat"), 1, False)
 

@@ -12,7 +12,8 @@ import pytest
 from agent.config_file import ConfigError
 from agent.timeline import Phase
 from sim.recorded_world import RecordedWorld
-from sim.scenario import Scenario, check
+from sim.scenario import Scenario
+from sim.scenario_checks import check
 from sim.summary import reduce, summarize
 from sim.trial import open_world, run_trial
 from sim.world import Output, order

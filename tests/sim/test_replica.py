@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim.metrics import reduce_trial
-from sim.scenario import load
+from sim.scenario_file import load
 from sim.trial import run_trial
 
 WINDOW = (20.0, 60.0)

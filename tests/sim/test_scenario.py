@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from agent.config_file import ConfigError
-from sim.scenario import Scenario, apply_override, bundled, load, locate
+from sim.scenario import Scenario
+from sim.scenario_file import apply_override, bundled, load, locate
 
 
 def complaint(*overrides: str, name: str = "ut-clat") -> str:

@@ -17,7 +17,9 @@ from agent.estimation.observation import rotation
 from agent.timeline import Phase
 from sim.engine import TrialResult, VirtualEngine
 from sim.metrics import components, nees, position_errors
-from sim.scenario import Scenario, check, load
+from sim.scenario import Scenario
+from sim.scenario_checks import check
+from sim.scenario_file import load
 from sim.world import Output, SimulatedWorld
 
 Array = NDArray[np.float64]

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from sim.engine import TrialResult
 from sim.metrics import nees
-from sim.scenario import Scenario, check
+from sim.scenario import Scenario
+from sim.scenario_checks import check
 from sim.summary import reduce, summarize
 from sim.trial import run_trial
 from tests.assertions import anees_band

@@ -8,7 +8,7 @@ import pytest
 from agent.config_file import ConfigError
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import compose
-from sim.scenario import load
+from sim.scenario_file import load
 from sim.world import SimulatedWorld
 
 SHORT = ["duration_s=40.0", "window_s=[10, 40]"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sim.metrics import StateTrace, TrialTrace
-from sim.scenario import load
+from sim.scenario_file import load
 from sim.store import FILE, load_trace, save_trace
 from sim.trial import run_trial
 

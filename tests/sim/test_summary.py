@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from sim.scenario import BoundPart, Scenario, load
+from sim.scenario import BoundPart, Scenario
+from sim.scenario_file import load
 from sim.summary import faults, reduce, summarize, unmet
 from sim.trial import run_trial
 

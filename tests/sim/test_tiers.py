@@ -18,7 +18,7 @@ from sim.metrics import combine
 from sim.recordings.calibrate import main, pair_biases
 from sim.recordings.recording import RecordingError
 from sim.recordings.tiers import load
-from sim.scenario import load as load_scenario
+from sim.scenario_file import load as load_scenario
 from sim.summary import reduce
 from sim.trial import open_world, run_trial
 

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim.metrics import trial_figures
-from sim.scenario import load
+from sim.scenario_file import load
 from sim.summary import reduce, summarize
 from sim.trial import run_trial
 from sim.trial_store import FILE, StoreBusy, TrialStore, pack, records

@@ -9,7 +9,7 @@ import pytest
 
 from agent.config_file import ConfigError
 from sim import bound, variants
-from sim.scenario import load
+from sim.scenario_file import load
 from sim.variants import bound_leaders, choices, parse
 
 

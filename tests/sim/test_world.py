@@ -13,7 +13,9 @@ from agent.config_file import ConfigError
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import LAYOUTS, between, velocity_step
 from agent.timeline import Phase
-from sim.scenario import Scenario, check, load
+from sim.scenario import Scenario
+from sim.scenario_checks import check
+from sim.scenario_file import load
 from sim.world import Output, SimulatedWorld, control_odometry, draw_phases, order
 
 Array = NDArray[np.float64]
