@@ -195,13 +195,15 @@ class JointModel:
             if name in tracks:
                 part += range(block.start, block.stop)
                 ages.append(max(state.t_ns - learnt_ns, 0))
-        square = np.ix_(part, part)
-        private = state.split.private[square]
+        mean, cov, private = state.mean, state.cov, state.split.private
+        if len(part) < len(mean):
+            square = np.ix_(part, part)
+            mean, cov, private = mean[part], cov[square], private[square]
         return SplitSnapshot(
             self._settings.layout.name,
             tuple(item for item in layout.models if item[0] in tracks),
-            state.mean[part],
-            state.cov[square],
+            mean,
+            cov,
             private if private.any() else None,
             tuple(ages),
             self.tracks.told(state)[:relayed],

@@ -70,6 +70,7 @@ class SplitFilter:
         self._motions = {target.id: target.motion for target in settings.targets}
         self._clocks = PairClocks(settings)
         self._exchanges: dict[str, SplitExchange] = {}
+        self._waiting: dict[str, SplitExchange] = {}
         self._lives: dict[str, tuple[int, int]] = {}
         self._contacts: dict[str, Epoch] = {}
         self._told_of: tuple[JointState | None, Estimate] = None, Estimate(0, "", settings.mean, settings.cov)
@@ -241,6 +242,7 @@ class SplitFilter:
             return
         told = tuple(self._clocks.widened(peer, item) for item in measurements[:MAX_MEASUREMENTS])
         request = exchange.open(t_ns, now_ns, told, self._told(then, told))
+        self._waiting[peer] = exchange
         self._counters["pair.started"] += 1
         effects.append(Send(peer, t_ns, request))
 
@@ -341,8 +343,9 @@ class SplitFilter:
         """Nothing is told to everybody."""
 
     def expire(self, now_ns: int, effects: list[Effect]) -> None:
-        for peer, exchange in self._exchanges.items():
+        for peer, exchange in list(self._waiting.items()):
             if not exchange.waiting:
+                del self._waiting[peer]
                 continue
             repeat, gone = exchange.expired(now_ns)
             for request in repeat:
@@ -352,7 +355,9 @@ class SplitFilter:
                 self._counters["pair.timed_out"] += gone
 
     def deadline_ns(self) -> int:
-        waiting = [exchange.deadline_ns() for exchange in self._exchanges.values() if exchange.waiting]
+        if not self._waiting:
+            return FAR_FUTURE_NS
+        waiting = [exchange.deadline_ns() for exchange in self._waiting.values() if exchange.waiting]
         return min(waiting, default=FAR_FUTURE_NS)
 
 

@@ -34,6 +34,7 @@ class PeerClock:
 
     def __init__(self) -> None:
         self._exchanges: deque[_Exchange] = deque(maxlen=KEPT_EXCHANGES)
+        self._best: _Exchange | None = None
         self._latest_ns = 0
         self.steps = 0
         """How often an exchange contradicted all before it, which only a clock that was set can do."""
@@ -48,7 +49,7 @@ class PeerClock:
         if min(t1_ns, t2_ns) < 0 or t3_ns < t2_ns or round_trip_ns < 0 or t4_ns - t1_ns > MAX_SPAN_NS:
             return False
         exchange = _Exchange(((t2_ns - t1_ns) + (t3_ns - t4_ns)) // 2, round_trip_ns, t1_ns)
-        best = self._best(t4_ns)
+        best = self._best
         if best is not None:
             # Both errors are bounds: offsets further apart than their sum are of two different clocks.
             apart_ns = abs(exchange.offset_ns - best.offset_ns)
@@ -56,18 +57,17 @@ class PeerClock:
                 self._exchanges.clear()
                 self.steps += 1
         self._exchanges.append(exchange)
+        # Errors grow alike with time, so that which one is the least does not change with it.
+        self._best = min(self._exchanges, key=lambda known: known.error_ns(t4_ns))
         self._latest_ns = t4_ns
         return True
-
-    def _best(self, now_ns: int) -> _Exchange | None:
-        return min(self._exchanges, key=lambda exchange: exchange.error_ns(now_ns), default=None)
 
     def at(self, now_ns: int) -> tuple[int, int] | None:
         """(offset, standard deviation) [ns] as known at `now_ns` of our clock; None before an exchange.
 
         The deviation is that of an error spread evenly over its bound.
         """
-        best = self._best(now_ns)
+        best = self._best
         if best is None:
             return None
         return best.offset_ns, math.ceil(best.error_ns(now_ns) / math.sqrt(3))

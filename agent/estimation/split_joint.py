@@ -12,7 +12,7 @@ since a metric that one unobservable direction dominates would refuse useful upd
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,9 +38,14 @@ class Split:
     private: Array
     shared: Array
 
+    _cov: Array | None = field(default=None, init=False, repr=False)
+
     @property
     def cov(self) -> Array:
-        return self.private + self.shared
+        if self._cov is None:
+            object.__setattr__(self, "_cov", self.private + self.shared)
+        assert self._cov is not None
+        return self._cov
 
     def mapped(self, A: Array, private_noise: Array | None = None, shared_noise: Array | None = None) -> Split:
         """The split after the error was mapped by A (m, n) and independent noise (m, m) was added to either part."""
@@ -53,7 +58,7 @@ class Split:
 
     def told(self) -> Split:
         """The split once the belief has been sent: what was private may be held by a peer now."""
-        return Split(np.zeros_like(self.private), symmetrize(self.private + self.shared))
+        return Split(np.zeros_like(self.private), self.cov)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
