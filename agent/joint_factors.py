@@ -69,6 +69,9 @@ SAME_TARGET_M2 = 4e-2
 Ten contacts a second would average out what factors miss about third robots if the tracks were tied more firmly.
 """
 
+NOTICEABLE = 0.1
+"""Second-order residuals below this share of a variance do not count: in hours they would add up to something."""
+
 ROUNDING = 1e-6
 """Share of the variances by which a covariance is lifted that rounding has made indefinite."""
 
@@ -83,7 +86,7 @@ class JointFactors:
         self.joint = JointLayout(settings)
         self.group: frozenset[str] | None = None
         self.nonlinearity = 0.0
-        """Second-order residuals of all measurements of robots and targets so far, as shares of their variances, one
+        """Noticeable second-order residuals of measurements of robots and targets so far, as shares of variances, one
         at most each."""
 
     @property
@@ -148,7 +151,9 @@ class JointFactors:
         return applied(state.mean, state.cov, self.layout, K, seen.S, seen.nu, seen.nis, seen.H)
 
     def _note_nonlinearity(self, residual: Array, R: Array) -> None:
-        self.nonlinearity += min(float(np.max(residual.diagonal() / R.diagonal())), 1.0)
+        share = float(np.max(residual.diagonal() / R.diagonal()))
+        if share > NOTICEABLE:
+            self.nonlinearity += min(share, 1.0)
 
     # -- what is told ---------------------------------------------------------------------------------------
 

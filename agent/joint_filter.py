@@ -23,7 +23,7 @@ class JointFilter(FactorFilter):
 
     @property
     def nonlinearity(self) -> float:
-        """Second-order residuals of all measurements so far, as shares of their variances, one at most each."""
+        """Noticeable second-order residuals of measurements so far, as shares of their variances, one at most each."""
         return self._factors.nonlinearity
 
     def _model(self) -> FactorModel:
