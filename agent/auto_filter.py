@@ -140,7 +140,9 @@ class AutoFilter:
         joint, state = self._joint, self._joint.state
         tracks = tuple(track.target for track in joint.estimate().tracks)
         split_cov = Split(np.zeros_like(state.cov), state.cov)
-        start = JointState(state.t_ns, state.mean, split_cov, tracks, (state.t_ns,) * len(tracks))
+        # When something was last learnt of a track is not kept with factors: not before the start is what is known.
+        learnt_ns = (self._settings.start_ns,) * len(tracks)
+        start = JointState(state.t_ns, state.mean, split_cov, tracks, learnt_ns)
         split = SplitFilter(self._settings, self._counters, self._count_nis, start)
         split.take_over(joint.contacts())
         for event in self._lives.values():

@@ -108,21 +108,20 @@ class JointModel:
                 return Used(self.tracks.started(state, target, again, state.t_ns), None)
             if state.doubted.get(target, 0) >= CONTRADICTIONS:
                 state = self.tracks.without(state, {target})
-                return self._again(state, target, model, track, z, R)
+                return self._again(state, target, model, z, R)
         used = self._measured(state, model, z, R, self._layout(state).with_target(target), RESIDUAL_FACTOR)
         state = self.tracks.judged(used.state, target, used.nis is None or used.nis <= CONTRADICTING)
         return replace(used, state=learnt(state, {target: state.t_ns}))
 
-    def _again(
-        self, state: JointState, target: str, model: RelativeModel, was: tuple[Array, Array], z: Array, R: Array
-    ) -> Used:
-        """Begin the track of a target anew whose belief `was` has been contradicted on end: it was on a wrong side."""
+    def _again(self, state: JointState, target: str, model: RelativeModel, z: Array, R: Array) -> Used:
+        """Begin a track anew that has been contradicted on end, and is out of `state`: it was on a wrong side."""
         own, rules = (state.mean[self._own], state.cov[self._own, self._own]), self.tracks.rules
         start = rules.started(target, model, own, state.t_ns, z, R)
         if start is not None:
             return Used(self.tracks.started(state, target, start, state.t_ns), None)
-        apart = float(np.hypot(*(was[0][:2] - own[0][:2])))
-        start = rules.started_vaguely(target, model, own, state.t_ns, z, R, 2.0 * max(apart, float(z[0])))
+        # A range tells how far off the target is, a bearing does not: without a limit in the settings the track ends.
+        within_m = float(z[0]) if model.kind == "range" else None
+        start = rules.started_vaguely(target, model, own, state.t_ns, z, R, within_m)
         if start is None:
             return Used(state, None)
         return Used(self.tracks.beside(state, target, start.mean, start.cov(own[1])), None)

@@ -159,3 +159,11 @@ def test_one_outlier_is_the_sensors_fault() -> None:
     for off in (50.0, 0.0, 50.0, 0.0, 50.0, 0.0):
         state = subject.sighting(state, "t1", sensor, clean + off, 0.01 * np.eye(2)).state
     assert state.tracks == ("t1",)
+
+
+def test_a_contradicted_track_ends_where_a_bearing_cannot_say_how_far_off_the_target_is() -> None:
+    subject = model("unscented")
+    state = replace(subject.tracks.initial(), doubted={"t1": CONTRADICTIONS})
+    sensor = RelativeModel("bearing", subject._settings.layout, subject=CONSTANT_VELOCITY)
+    after = subject.sighting(state, "t1", sensor, np.array([2.0]), 0.01 * np.eye(1)).state
+    assert after.tracks == () and after.relayed == {} and after.doubted == {}
