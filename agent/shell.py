@@ -368,6 +368,8 @@ FATE_COLUMNS = (
     "lost",
     "delay_ns",
     "duplicate",
+    "cause",
+    "corrupted",
 )
 
 

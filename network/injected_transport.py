@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 
 from network.links import LinkModel
 from network.messages import Packet
@@ -34,19 +35,12 @@ class LinkInjector:
             # Rubbish has no fate of its own; the endpoint counts it.
             self._deliver(packet)
             return
-        delays = self._links.decide(
-            source=packet.source,
-            destination=self._robot,
-            channel=packet.channel,
-            incarnation=header.incarnation,
-            seq=header.seq,
-            t_send_ns=header.t_send_ns,
-        )
-        self.counters["lost" if not delays else "delivered"] += 1
-        for delay in delays:
+        arrivals = self._links.carry(packet, header, self._robot, header.t_send_ns)
+        self.counters["lost" if not arrivals else "delivered"] += 1
+        for delay, arriving in arrivals:
             # Nobody sends in the future: a stamp that says so must not hold a packet for longer than its delay.
             wait = min(delay, header.t_send_ns + delay - self._now_ns())
             if delay == 0 or wait <= 0:
-                self._deliver(packet)
+                self._deliver(arriving)
             else:
-                self._call_later(wait, lambda: self._deliver(packet))
+                self._call_later(wait, partial(self._deliver, arriving))

@@ -11,15 +11,15 @@ import math
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from hashlib import blake2b
-from struct import pack, unpack
+from dataclasses import dataclass, replace
 from typing import Any
 
 import msgpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from network.faults import UNHARMED, LinkFaults, Parcel, corrupted, exponential_ns, uniforms
+from network.messages import Header, Packet
 from network.wire_fields import MAX_INT, WireError, valid_id
 
 MAX_TABLE_ROBOTS = 256
@@ -78,12 +78,8 @@ def packet_fate(
 
     `destination` is the robot that would receive it, for a broadcast too.
     """
-    digest = blake2b(digest_size=32, key=pack("<Q", settings.seed))
-    for text in (source, destination, channel):
-        encoded = text.encode()
-        digest.update(pack("<I", len(encoded)) + encoded)
-    digest.update(pack("<QQ", incarnation, seq))
-    loss, duplicate, tail, second_tail = (word * 2.0**-64 for word in unpack("<4Q", digest.digest()))
+    parcel = Parcel(source, destination, channel, incarnation, seq, 0)
+    loss, duplicate, tail, second_tail = uniforms(settings.seed, "", parcel)
     return Fate(
         lost=loss < settings.loss,
         delay_ns=_delay_ns(settings, tail),
@@ -92,13 +88,12 @@ def packet_fate(
 
 
 def _delay_ns(settings: LinkSettings, uniform: float) -> int:
-    tail_s = -settings.delay_tail_s * math.log1p(-min(uniform, 1.0 - 2.0**-53))
-    return round((settings.delay_s + tail_s) * 1e9)
+    return round(settings.delay_s * 1e9) + exponential_ns(settings.delay_tail_s * 1e9, uniform)
 
 
 @dataclass(frozen=True, slots=True)
 class FateRecord:
-    """One line of the fate log. `duplicate`: the packet arrived twice."""
+    """One line of the fate log. `duplicate`: the packet arrived more than once; `cause`: the fault that lost it."""
 
     source: str
     destination: str
@@ -110,6 +105,16 @@ class FateRecord:
     lost: bool
     delay_ns: int
     duplicate: bool
+    cause: str = ""
+    corrupted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """Delays [ns] after which a packet arrives, none if it does not; and whether it is damaged on its way."""
+
+    delays_ns: tuple[int, ...]
+    corrupted: bool = False
 
 
 LinkState = Callable[[str, str, int], bool]
@@ -117,58 +122,88 @@ LinkState = Callable[[str, str, int], bool]
 
 
 class LinkModel:
-    """Decides for every packet. `link_state` is asked only when `settings.range_m` is set."""
+    """Decides for every packet. `link_state` is asked only when `settings.range_m` is set.
+
+    `faults` come on top of what is true of all links at all times.
+    """
 
     def __init__(
         self,
         settings: LinkSettings,
         link_state: LinkState,
         log: Callable[[FateRecord], None] | None = None,
+        faults: LinkFaults | None = None,
     ) -> None:
         self.settings = settings
+        self.faults = faults if faults is not None else LinkFaults(settings.seed)
         self.counters: Counter[str] = Counter()
         self._link_state = link_state
         self._log = log
 
-    def decide(
-        self, *, source: str, destination: str, channel: str, incarnation: int, seq: int, t_send_ns: int
-    ) -> list[int]:
-        """Delays [ns] after which the packet arrives: none, one, or two.
+    def carry(self, packet: Packet, header: Header, destination: str, t_send_ns: int) -> list[tuple[int, Packet]]:
+        """(delay [ns], packet) of everything that arrives of a packet sent at `t_send_ns` of fleet time."""
+        parcel = Parcel(
+            packet.source,
+            destination,
+            packet.channel,
+            header.incarnation,
+            header.seq,
+            t_send_ns,
+            len(packet.payload),
+        )
+        decision = self.decide(parcel)
+        if decision.corrupted:
+            packet = replace(packet, payload=corrupted(packet.payload, self.settings.seed, parcel))
+        return [(delay_ns, packet) for delay_ns in decision.delays_ns]
 
-        Counted as `out_of_range`, `lost`, or `delivered` and `duplicated`.
+    def decide(self, parcel: Parcel) -> Decision:
+        """What becomes of a packet.
+
+        Counted as `out_of_range`, `lost`, or `delivered` and `duplicated`, `corrupted`; lost by a fault also as
+        `fault.<name>`.
         """
         fate = packet_fate(
             self.settings,
-            source=source,
-            destination=destination,
-            channel=channel,
-            incarnation=incarnation,
-            seq=seq,
+            source=parcel.source,
+            destination=parcel.destination,
+            channel=parcel.channel,
+            incarnation=parcel.incarnation,
+            seq=parcel.seq,
         )
-        in_range = self.settings.range_m is None or self._link_state(source, destination, t_send_ns)
+        in_range = self.settings.range_m is None or self._link_state(
+            parcel.source, parcel.destination, parcel.t_send_ns
+        )
         arrives = in_range and not fate.lost
-        duplicate_ns = fate.duplicate_delay_ns if arrives else None
+        effect = self.faults.on(parcel) if arrives and self.faults.faults else UNHARMED
+        delays_ns: tuple[int, ...] = ()
+        if effect.cause is not None:
+            arrives = False
+            self.counters[f"fault.{effect.cause}"] += 1
+        if arrives:
+            delays_ns = (fate.delay_ns + effect.delay_ns, *(fate.delay_ns + copy for copy in effect.copies_ns))
+            if fate.duplicate_delay_ns is not None:
+                delays_ns += (fate.duplicate_delay_ns + effect.delay_ns,)
+            self.counters["duplicated"] += len(delays_ns) - 1
+            self.counters["corrupted"] += effect.corrupted
         self.counters["delivered" if arrives else "lost" if in_range else "out_of_range"] += 1
-        if duplicate_ns is not None:
-            self.counters["duplicated"] += 1
         if self._log is not None:
             self._log(
                 FateRecord(
-                    source,
-                    destination,
-                    channel,
-                    incarnation,
-                    seq,
-                    t_send_ns,
+                    parcel.source,
+                    parcel.destination,
+                    parcel.channel,
+                    parcel.incarnation,
+                    parcel.seq,
+                    parcel.t_send_ns,
                     in_range,
-                    fate.lost,
-                    fate.delay_ns,
-                    duplicate_ns is not None,
+                    fate.lost or effect.cause is not None,
+                    fate.delay_ns + effect.delay_ns,
+                    len(delays_ns) > 1,
+                    effect.cause or "",
+                    effect.corrupted,
                 )
             )
-        if not arrives:
-            return []
-        return [fate.delay_ns] if duplicate_ns is None else [fate.delay_ns, duplicate_ns]
+        return Decision(delays_ns, effect.corrupted)
 
 
 # --- who hears whom ---------------------------------------------------------------------------------------

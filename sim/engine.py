@@ -278,17 +278,10 @@ class VirtualEngine:
         for receiver in receivers:
             if receiver is None or receiver == packet.source or receiver not in self._nodes:
                 continue
-            delays = self._links.decide(
-                source=packet.source,
-                destination=receiver,
-                channel=packet.channel,
-                incarnation=header.incarnation,
-                seq=header.seq,
-                t_send_ns=header.t_send_ns,
-            )
-            self._traffic["delivered" if delays else "lost"] += 1
-            for delay in delays:
-                self._push(self._now + delay, DELIVERY, receiver, packet)
+            arrivals = self._links.carry(packet, header, receiver, self._now)
+            self._traffic["delivered" if arrivals else "lost"] += 1
+            for delay, arriving in arrivals:
+                self._push(self._now + delay, DELIVERY, receiver, arriving)
 
     def _push(self, t_ns: int, phase: int, robot: str, what: Any) -> None:
         self._pushed += 1

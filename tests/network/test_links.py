@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from network.faults import Parcel
 from network.links import (
     MAX_TABLE_BYTES,
     FateRecord,
@@ -117,13 +118,13 @@ def test_every_packet_is_counted_once_and_logged() -> None:
     log: list[FateRecord] = []
     harsh_with_range = LinkSettings(seed=3, range_m=10, loss=0.3, delay_s=0.1, delay_tail_s=0.05, duplicate=0.2)
     model = LinkModel(harsh_with_range, lambda source, destination, t_ns: t_ns < 800, log.append)
-    arrivals = [model.decide(**(PACKET | {"seq": seq}), t_send_ns=seq) for seq in range(1_000)]
+    arrivals = [model.decide(Parcel(**(PACKET | {"seq": seq}), t_send_ns=seq)).delays_ns for seq in range(1_000)]
     counters = model.counters
     assert counters["delivered"] + counters["lost"] + counters["out_of_range"] == 1_000
     assert counters["out_of_range"] == 200
     assert counters["delivered"] == sum(len(delays) > 0 for delays in arrivals)
     assert counters["duplicated"] == sum(len(delays) == 2 for delays in arrivals) > 0
-    assert all(delays == [] for delays in arrivals[800:])
+    assert all(delays == () for delays in arrivals[800:])
     for record, delays in zip(log, arrivals, strict=True):
         assert (record.in_range and not record.lost) == bool(delays)
         assert record.duplicate == (len(delays) == 2)
@@ -134,14 +135,14 @@ def test_without_a_range_the_world_is_not_asked() -> None:
     def nobody(source: str, destination: str, t_send_ns: int) -> bool:
         raise AssertionError
 
-    assert LinkModel(LinkSettings(seed=1), nobody).decide(**PACKET, t_send_ns=0) == [0]
+    assert LinkModel(LinkSettings(seed=1), nobody).decide(Parcel(**PACKET, t_send_ns=0)).delays_ns == (0,)
 
 
 def test_two_receivers_agree_on_a_packets_fate_without_talking() -> None:
     one, two = LinkModel(HARSH, everywhere), LinkModel(HARSH, everywhere)
     for seq in reversed(range(50)):
-        one.decide(**(PACKET | {"seq": seq}), t_send_ns=seq)
-    assert one.decide(**PACKET, t_send_ns=0) == two.decide(**PACKET, t_send_ns=0)
+        one.decide(Parcel(**(PACKET | {"seq": seq}), t_send_ns=seq))
+    assert one.decide(Parcel(**PACKET, t_send_ns=0)).delays_ns == two.decide(Parcel(**PACKET, t_send_ns=0)).delays_ns
 
 
 # --- range ------------------------------------------------------------------------------------------------
