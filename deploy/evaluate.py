@@ -14,7 +14,8 @@ from agent.shell import FATE_COLUMNS
 from deploy.launch import Outcome
 from network.messages import PairReply, ReplyStatus
 from sim.bound import BoundRunner
-from sim.engine import MeasurementLog, Sampler, TrialResult, network_figures, sample_stride
+from sim.engine import TrialResult, network_figures
+from sim.sampling import MeasurementLog, Sampler, sample_stride
 from sim.scenario import Scenario
 from sim.world import World
 

@@ -6,7 +6,6 @@ delay an exchange of messages completes before the next thing happens; timers co
 
 from __future__ import annotations
 
-import hashlib
 import heapq
 import time
 from collections import Counter
@@ -17,25 +16,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.motion import LAYOUTS
-from agent.node import Node, Outgoing, Recorder, rejected
+from agent.node import Node, Outgoing, Recorder
 from agent.sensor_input import encode
 from agent.settings import NS
 from network.links import FateRecord, LinkModel, RangeTable
 from network.messages import Epoch, Packet
 from network.wire import peek_header
-from sim.agents import agent_config
+from sim.agents import agent_config, autopilot_fix
 from sim.bound import BoundRunner
-from sim.metrics import StateTrace, TrialTrace
+from sim.engine_faults import ClockChange, EngineFaults, Forged, Happening, Pause, Resume, Start, Stop
+from sim.fault_plan import trial_faults
+from sim.faulty_world import with_faults
+from sim.lives import Process
+from sim.metrics import TrialTrace
 from sim.reach import Reach
+from sim.sampling import MeasurementLog, Sampler
 from sim.scenario import Scenario
 from sim.world import Output, World
 
 Array = NDArray[np.float64]
 FateSink = Callable[[FateRecord], None]
 
-SOFTWARE = "cofix-0.1.0"
-DELIVERY, TIMER = -1, 99
+FAULT, DELIVERY, TIMER = -2, -1, 99
 
 
 def network_figures(traffic: Counter[str], counters: dict[str, dict[str, int]]) -> dict[str, Any]:
@@ -70,90 +72,6 @@ class TrialResult:
     """Instants [s] at which a robot measured somebody, by (robot, of)."""
 
 
-class MeasurementLog:
-    """When a world offered a relative measurement, by robot and whom it measured."""
-
-    def __init__(self) -> None:
-        self._found: dict[tuple[str, str], list[int]] = {}
-
-    def add(self, outputs: list[Output]) -> None:
-        for item in outputs:
-            if item.of is not None:
-                times = self._found.setdefault((item.robot, item.of), [])
-                if not times or times[-1] != item.t_ns:
-                    times.append(item.t_ns)
-
-    def instants(self) -> dict[tuple[str, str], Array]:
-        """Ascending times [s] by (robot, of); sensors that measure together count once."""
-        return {key: np.unique(times) / NS for key, times in sorted(self._found.items())}
-
-
-def sample_stride(step_ns: int) -> int:
-    """Steps between two samples of the figures: every step, but at most once per second."""
-    return max(1, -(-NS // step_ns))
-
-
-class Sampler:
-    """Collects truth and estimates at the sampled instants into a `TrialTrace`."""
-
-    def __init__(self, scenario: Scenario, world: World, with_bound: bool) -> None:
-        self._world = world
-        self._stride = sample_stride(world.step_ns)
-        self._instants = list(range(0, world.steps + 1, self._stride))
-        self._layouts = {name: LAYOUTS[part.model] for name, part in scenario.movers().items()}
-        self._owned: dict[tuple[str, str], tuple[Array, Array]] = {}
-        for robot in world.robots:
-            for entity in (robot, *world.targets):
-                self._owned[robot, entity] = self._blank(entity)
-        self._bound = {name: self._blank(name) for name in (*world.robots, *world.targets)} if with_bound else None
-
-    def _blank(self, entity: str) -> tuple[Array, Array]:
-        n, count = self._layouts[entity].dim, len(self._instants)
-        return np.full((count, n), np.nan), np.full((count, n, n), np.nan)
-
-    def row(self, k: int) -> int | None:
-        """Index of instant k among the samples, None if it is not sampled."""
-        return k // self._stride if k % self._stride == 0 else None
-
-    def put(self, robot: str, entity: str, row: int, mean: Array, cov: Array) -> None:
-        means, covs = self._owned[robot, entity]
-        means[row], covs[row] = mean, cov
-
-    def put_bound(self, entity: str, row: int, belief: tuple[Array, Array] | None) -> None:
-        """None: there is no belief (yet)."""
-        assert self._bound is not None
-        if belief is not None:
-            self._bound[entity][0][row], self._bound[entity][1][row] = belief
-
-    def trace(self) -> TrialTrace:
-        truths = {
-            name: np.array([self._world.truth(name, k) for k in self._instants])
-            for name in (*self._world.robots, *self._world.targets)
-        }
-
-        def state(entity: str, belief: tuple[Array, Array]) -> StateTrace:
-            layout, known = self._layouts[entity], truths[entity].shape[1]
-            # What nobody knows the truth of (gains of a recorded odometry) has no figures.
-            mean, cov = belief[0][:, :known], belief[1][:, :known, :known]
-            return StateTrace(truths[entity], mean, cov, layout.angles, layout.position)
-
-        bound = None
-        if self._bound is not None:
-            bound = {
-                "robots": {name: state(name, self._bound[name]) for name in self._world.robots},
-                "targets": {name: state(name, self._bound[name]) for name in self._world.targets},
-            }
-        return TrialTrace(
-            t_s=np.array(self._instants) * self._world.step_ns / NS,
-            robots={name: state(name, self._owned[name, name]) for name in self._world.robots},
-            targets={
-                target: {name: state(target, self._owned[name, target]) for name in self._world.robots}
-                for target in self._world.targets
-            },
-            bound=bound,
-        )
-
-
 class VirtualEngine:
     """One trial in virtual time."""
 
@@ -167,29 +85,28 @@ class VirtualEngine:
         recorders: dict[str, Recorder] | None = None,
         fate_sink: FateSink | None = None,
     ) -> None:
+        self._faults = EngineFaults(trial_faults(scenario, seed), seed)
+        world = with_faults(world, self._faults.sensors, seed, [(r.id, autopilot_fix(r)) for r in scenario.robots])
         self._scenario, self._world = scenario, world
         self._heap: list[tuple[int, int, str, int, str, Any]] = []
         self._pushed = 0
         self._now = 0
-        self._nodes: dict[str, Node] = {}
         self._timers: dict[str, int] = {}
         self._ticked: dict[str, int] = {}
-        for robot in scenario.robots:
-            config = agent_config(scenario, world, robot)
-            boot = hashlib.blake2b(f"{seed}/{robot.id}".encode(), digest_size=7).digest()
-            self._nodes[robot.id] = Node(
-                config.settings(0),
-                config.network.settings(config.lateness.horizon_s),
-                boot_id=int.from_bytes(boot, "little"),
-                incarnation=1,
-                software=SOFTWARE,
-                sensors=config.sensor_configs(),
-                recorder=(recorders or {}).get(robot.id),
+        self._processes = {
+            robot.id: Process(
+                robot.id,
+                agent_config(scenario, world, robot),
+                seed,
+                (recorders or {}).get(robot.id),
+                self._faults.clock(robot.id),
             )
+            for robot in scenario.robots
+        }
         self._range = RangeTable()
         links = scenario.links
         self._reach = None if links.range_m is None else Reach(world, links.range_m, links.hysteresis_m)
-        self._links = LinkModel(scenario.links.settings(seed), self._range.state, fate_sink)
+        self._links = LinkModel(links.settings(seed), self._range.state, fate_sink, self._faults.links)
         self._sampler = Sampler(scenario, world, with_bound)
         self._bound = BoundRunner(scenario, world) if with_bound else None
         self.contacts: list[tuple[float, str, str]] = []
@@ -199,10 +116,17 @@ class VirtualEngine:
         self._traffic: Counter[str] = Counter()
         self.step_us: list[float] = []
 
+    @property
+    def nodes(self) -> dict[str, Node]:
+        """The robots that are up, by id."""
+        return {name: process.node for name, process in self._processes.items() if process.node is not None}
+
     def run(self, progress: Callable[[int, int], None] | None = None) -> TrialResult:
         """Play the whole scenario."""
         self._publish_range(0)
-        for robot in self._nodes:
+        for t_ns, robot, what in self._faults.happenings(self._processes):
+            self._push(t_ns, FAULT, robot, what)
+        for robot in self._processes:
             self._arm(robot)
         self._sample(0)
         for k in range(1, self._world.steps + 1):
@@ -212,7 +136,7 @@ class VirtualEngine:
             for item in outputs:
                 self._push(item.t_ns, int(item.phase), item.robot, item)
             self._play(k)
-            self.step_us.append((time.perf_counter() - started) * 1e6 / len(self._nodes))
+            self.step_us.append((time.perf_counter() - started) * 1e6 / len(self._processes))
             if self._bound is not None:
                 self._bound.step(k, outputs)
             self._sample(k)
@@ -224,42 +148,89 @@ class VirtualEngine:
         """Everything up to and including instant k. Who hears whom follows the positions at each instant."""
         end = k * self._world.step_ns
         while self._heap and self._heap[0][0] <= end:
-            t_ns, _, _, _, robot, what = heapq.heappop(self._heap)
+            t_ns, phase, _, _, robot, what = heapq.heappop(self._heap)
             if t_ns == end and self._now < end:
                 self._publish_range(k)
             self._now = t_ns
-            node = self._nodes[robot]
-            if isinstance(what, Output):
-                payload = encode(
-                    t_ns,
-                    what.kind,
-                    what.z,
-                    what.R,
-                    of=what.of,
-                    sensor=what.sensor,
-                    t0_ns=what.t0_ns,
-                    attitude=what.attitude,
-                )
-                self._carry_out(robot, node.on_sensor(t_ns, payload))
+            process = self._processes[robot]
+            if phase == FAULT:
+                self._happen(process, what)
+            elif isinstance(what, Output):
+                self._sensed(process, what)
             elif isinstance(what, Packet):
-                self._carry_out(robot, node.on_packet(t_ns, what))
+                self._arrived(process, what)
             elif self._timers.get(robot) == t_ns:
                 del self._timers[robot]
                 self._ticked[robot] = t_ns
-                self._carry_out(robot, node.on_tick(t_ns))
-            self._note_contacts(robot, node)
+                if process.node is not None and process.runs:
+                    self._carry_out(robot, process.node.on_tick(process.clock.local_ns(t_ns)))
+            self._note_contacts(process)
         if self._now < end:
             self._publish_range(k)
             self._now = end
 
-    def _note_contacts(self, robot: str, node: Node) -> None:
+    def _sensed(self, process: Process, item: Output) -> None:
+        """A datum reaches its robot, stamped by the robot's clock."""
+        if process.node is None or not process.runs:
+            process.keep_datum(item)
+            return
+        local_ns = process.clock.local_ns
+        payload = encode(
+            local_ns(item.t_ns),
+            item.kind,
+            item.z,
+            item.R,
+            of=item.of,
+            sensor=item.sensor,
+            t0_ns=None if item.t0_ns is None else local_ns(item.t0_ns),
+            attitude=item.attitude,
+        )
+        self._carry_out(process.robot, process.node.on_sensor(local_ns(self._now), payload))
+
+    def _arrived(self, process: Process, packet: Packet) -> None:
+        if process.node is None or not process.runs:
+            process.keep_packet(packet)
+            return
+        self._carry_out(process.robot, process.node.on_packet(process.clock.local_ns(self._now), packet))
+
+    def _happen(self, process: Process, what: Happening) -> None:
+        """A fault of a process or clock, or a forged packet."""
+        match what:
+            case Stop():
+                process.stop()
+            case Start(keep_state):
+                process.start(keep_state)
+                self._applied.pop(process.robot, None)
+            case Pause():
+                process.pause()
+            case Resume():
+                waiting = process.resume()
+                for item in waiting.data:
+                    self._sensed(process, item)
+                for packet in waiting.packets:
+                    self._arrived(process, packet)
+            case Forged(forger):
+                forged = forger.packet(self._now)
+                if forged is not None:
+                    self._traffic["forged"] += 1
+                    self._arrived(process, forged)
+                following = forger.next_ns(self._now)
+                if following is not None:
+                    self._push(following, FAULT, process.robot, what)
+            case ClockChange():
+                pass
+        self._arm(process.robot)
+
+    def _note_contacts(self, process: Process) -> None:
         """Pairs whose base contact is a new one since the last look."""
-        counters = node.agent.counters
-        applied = counters["pair.applied_initiator"] + counters["pair.applied_responder"]
+        if process.node is None:
+            return
+        agent, robot = process.node.agent, process.robot
+        applied = agent.counters["pair.applied_initiator"] + agent.counters["pair.applied_responder"]
         if applied == self._applied.get(robot, 0):
             return
         self._applied[robot] = applied
-        for peer, epoch in sorted(node.agent.filter.contacts().items()):
+        for peer, epoch in sorted(agent.filter.contacts().items()):
             if epoch != self._bases.get((robot, peer)):
                 self._bases[robot, peer] = epoch
                 self.contacts.append((self._now / NS, robot, peer))
@@ -274,12 +245,13 @@ class VirtualEngine:
         assert header is not None
         self._traffic["sent"] += 1
         self._traffic["bytes"] += len(packet.payload)
-        receivers = [packet.destination] if packet.destination is not None else list(self._nodes)
+        receivers = [packet.destination] if packet.destination is not None else list(self._processes)
         for receiver in receivers:
-            if receiver is None or receiver == packet.source or receiver not in self._nodes:
+            if receiver is None or receiver == packet.source or receiver not in self._processes:
                 continue
             arrivals = self._links.carry(packet, header, receiver, self._now)
             self._traffic["delivered" if arrivals else "lost"] += 1
+            self._faults.overheard(receiver, packet)
             for delay, arriving in arrivals:
                 self._push(self._now + delay, DELIVERY, receiver, arriving)
 
@@ -289,9 +261,13 @@ class VirtualEngine:
         heapq.heappush(self._heap, (t_ns, phase, rank, self._pushed, robot, what))
 
     def _arm(self, robot: str) -> None:
+        process = self._processes[robot]
+        if process.node is None or not process.runs:
+            self._timers.pop(robot, None)
+            return
         # A timer may end the present instant, but each instant ends once.
         earliest = self._now + 1 if self._ticked.get(robot) == self._now else self._now
-        deadline = max(self._nodes[robot].next_deadline_ns(), earliest)
+        deadline = process.clock.true_ns(process.node.next_deadline_ns(), earliest)
         if self._timers.get(robot) == deadline:
             return
         self._timers[robot] = deadline
@@ -305,8 +281,9 @@ class VirtualEngine:
         row = self._sampler.row(k)
         if row is None:
             return
-        for robot, node in self._nodes.items():
-            estimate = node.agent.estimate()
+        for robot, process in self._processes.items():
+            # What does not run tells nobody anything.
+            estimate = process.node.agent.estimate() if process.node is not None and process.runs else None
             if estimate is None:
                 continue
             self._sampler.put(robot, robot, row, estimate.mean, estimate.cov)
@@ -318,20 +295,15 @@ class VirtualEngine:
 
     def _result(self) -> TrialResult:
         refused: Counter[str] = Counter()
-        for node in self._nodes.values():
-            refused.update(rejected(node))
-        counters = {name: dict(sorted(node.agent.counters.items())) for name, node in self._nodes.items()}
-        nis = {
-            name: {kind: (entry.total, entry.count) for kind, entry in sorted(node.agent.nis.items())}
-            for name, node in self._nodes.items()
-        }
-        network = network_figures(self._traffic, counters)
+        for process in self._processes.values():
+            refused.update(process.rejected())
+        counters = {name: process.counters() for name, process in self._processes.items()}
         return TrialResult(
             self._sampler.trace(),
             self.contacts,
-            network,
+            network_figures(self._traffic, counters),
             dict(sorted(refused.items())),
-            nis,
+            {name: process.nis() for name, process in self._processes.items()},
             counters,
             self.step_us,
             self._measured.instants(),

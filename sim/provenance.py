@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from sim.agents import table
-from sim.engine import SOFTWARE
+from sim.lives import SOFTWARE
 from sim.scenario import Scenario
 
 FILE = "montecarlo.json"

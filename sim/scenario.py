@@ -39,6 +39,7 @@ from agent.config_parts import (
 )
 from agent.estimation.motion import TargetMotion
 from agent.estimation.observation import mount_of
+from agent.fault_parts import FaultPart
 from agent.sensor_input import SensorConfig
 from agent.settings import nanoseconds
 from agent.start_config import StartSource
@@ -207,6 +208,17 @@ class CentralizedPart(Part):
     pair_interval_s: NotNegative = 0.0
 
 
+class FaultPlanPart(Part):
+    """Faults drawn at random, anew for every trial: `calm` rare and short ones, `field` a bad day, `storm` all at once.
+
+    None begins in the last `quiet_s`, and all are over by then.
+    """
+
+    intensity: Literal["calm", "field", "storm"]
+    quiet_s: NotNegative = 5.0
+    processes: bool = True
+
+
 class BoundPart(Part):
     """A condition on one figure of the summary."""
 
@@ -235,6 +247,8 @@ class Scenario(Part):
     targets: list[TargetPart] = []
     landmarks: list[LandmarkPart] = []
     centralized: CentralizedPart = CentralizedPart()
+    faults: list[FaultPart] = []
+    fault_plan: FaultPlanPart | None = None
     expect: dict[str, BoundPart] = {}
 
     def movers(self) -> dict[str, RobotPart | TargetPart]:

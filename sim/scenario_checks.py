@@ -11,6 +11,7 @@ from agent.config_parts import (
 )
 from agent.estimation.motion import LAYOUTS
 from agent.estimation.observation import RELATIVE_ANGLES
+from agent.fault_parts import SensorFaultPart, check_faults, named
 from agent.joint_room import check_room
 from agent.start_config import check_start
 from sim.scenario import KINDS, MIN_STEP_S, RobotPart, Scenario, SensorPart, TargetPart, sensor_kind
@@ -52,6 +53,7 @@ def check(scenario: Scenario) -> None:
         )
     _check_steering(scenario)
     _check_team(scenario)
+    _check_faults(scenario)
     for robot in scenario.robots:
         _check_mover(f"{scenario.name}: robots.{robot.id}", robot)
         if recorded and LAYOUTS[robot.model].altitude is not None:
@@ -95,6 +97,23 @@ def check(scenario: Scenario) -> None:
             )
         if not recorded and target.start.pose is None:
             raise ConfigError(f"{scenario.name}: targets.{target.id}.start.pose is missing")
+
+
+def _check_faults(scenario: Scenario) -> None:
+    """Faults are of robots and sensors that are there."""
+    robots = {robot.id: robot for robot in scenario.robots}
+    try:
+        check_faults(scenario.faults, robots)
+    except ConfigError as error:
+        raise ConfigError(f"{scenario.name}: {error}") from None
+    for name, fault in named(scenario.faults).items():
+        where = f"{scenario.name}: faults.{name}"
+        if isinstance(fault, SensorFaultPart) and fault.sensor is not None:
+            there = sorted(robots[fault.robot].sensors)
+            if fault.sensor not in there:
+                raise ConfigError(f"{where}: {fault.robot} has no sensor '{fault.sensor}'; it has: {', '.join(there)}")
+        if fault.at_s >= scenario.duration_s:
+            raise ConfigError(f"{where}: at_s = {fault.at_s:g} is after the run's end at {scenario.duration_s:g} s")
 
 
 def _check_team(scenario: Scenario) -> None:

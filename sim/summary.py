@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
+from agent.fault_parts import named as stated
+from agent.fault_parts import told
 from sim.engine import TrialResult
+from sim.fault_plan import trial_faults
 from sim.metrics import combine, reduce_trial
 from sim.scenario import BoundPart, Scenario
 
@@ -66,7 +69,7 @@ def summarize(
         },
         "rejected": dict(sorted(rejected.items())),
         "covariance_repairs": sum(item["repairs"] for item in reduced),
-        "faults": faults(scenario),
+        "faults": faults(scenario, seed if len(reduced) == 1 else None),
         "exit": exits if exits is not None else {robot.id: 0 for robot in scenario.robots},
         "timing": timing,
     }
@@ -82,8 +85,8 @@ def _nis(trials: list[dict[str, tuple[float, int]]]) -> dict[str, float]:
     return {kind: total[kind] / count[kind] for kind in sorted(count) if count[kind]}
 
 
-def faults(scenario: Scenario) -> list[str]:
-    """What was injected, in words."""
+def faults(scenario: Scenario, seed: int | None = None) -> list[str]:
+    """What was injected, in words; with the seed of a trial also what was drawn for it."""
     links, named = scenario.links, []
     if links.loss:
         named.append(f"loss {links.loss:g}")
@@ -91,7 +94,10 @@ def faults(scenario: Scenario) -> list[str]:
         named.append(f"delay {links.delay_s:g} s + tail {links.delay_tail_s:g} s")
     if links.duplicate:
         named.append(f"duplicate {links.duplicate:g}")
-    return named
+    found = stated(scenario.faults) if seed is None else trial_faults(scenario, seed)
+    if scenario.fault_plan is not None and seed is None:
+        named.append(f"a plan of intensity {scenario.fault_plan.intensity}, drawn for each trial")
+    return named + [told(name, fault) for name, fault in found.items()]
 
 
 def unmet(summary: dict[str, Any], expect: dict[str, BoundPart]) -> list[str]:

@@ -40,6 +40,7 @@ CONFIG_ONLY = (
     "agent/config.py",
     "agent/config_file.py",
     "agent/config_parts.py",
+    "agent/fault_parts.py",
     "agent/start_config.py",
     "sim/scenario.py",
 )

@@ -14,8 +14,9 @@ from agent.events import Event, LinkChange, Observation, Received
 from agent.node import Node, Outgoing
 from network.links import FateRecord, packet_fate
 from network.messages import Packet, PairReply, PairRequest, ReplyStatus, SplitReply, SplitRequest
-from sim.engine import TrialResult, VirtualEngine, network_figures, sample_stride
+from sim.engine import TrialResult, VirtualEngine, network_figures
 from sim.metrics import StateTrace
+from sim.sampling import sample_stride
 from sim.scenario import Scenario
 from sim.scenario_checks import check
 from sim.trial import open_world
@@ -82,7 +83,7 @@ class Run:
         return lambda event, effects: self.events.append((robot, event, effects))
 
     def endpoint_sum(self, name: str) -> int:
-        return sum(node.endpoint.counters[name] for node in self.engine._nodes.values())
+        return sum(node.endpoint.counters[name] for node in self.engine.nodes.values())
 
 
 def assert_equal_traces(left: StateTrace, right: StateTrace) -> None:
@@ -231,7 +232,7 @@ def test_traffic_adds_up(links: dict[str, Any]) -> None:
     assert figures["sent"] == len(hellos) + len(directed)
     assert len(run.fates) == 2 * len(hellos) + len(directed)
     assert run.endpoint_sum("received") == sum(len(arrivals(run, fate)) for fate in arrived)
-    for node in run.engine._nodes.values():
+    for node in run.engine.nodes.values():
         counters = node.endpoint.counters
         refused = sum(count for name, count in counters.items() if name.startswith("rejected."))
         assert counters["received"] == counters["delivered"] + counters["hellos"] + refused

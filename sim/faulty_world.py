@@ -1,0 +1,118 @@
+"""A world whose sensors and autopilots have faults. Truth is what it was; only what is told of it changes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.estimation.observation import RELATIVE_ANGLES
+from agent.fault_parts import AnySensorFaultPart, BiasPart, DropoutPart, OutliersPart, SilencePart
+from sim.noise import generator
+from sim.world import Output, World
+
+Array = NDArray[np.float64]
+
+ODOMETRY = "odometry"
+
+
+class FaultyWorld:
+    """`world` with sensor faults by name; draws are keyed by (seed, fault, robot, sensor, subject, instant).
+
+    `from_autopilot` names, by robot, the sensor whose fixes come from the autopilot, if any.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        faults: dict[str, AnySensorFaultPart],
+        seed: int,
+        from_autopilot: dict[str, str | None],
+        drop_silenced: bool = True,
+    ) -> None:
+        self._world, self._seed = world, seed
+        self._faults = [(name, fault, fault.span_ns()) for name, fault in faults.items()]
+        self._from_autopilot = from_autopilot
+        self._drop_silenced = drop_silenced
+        self.robots, self.targets, self.landmarks = world.robots, world.targets, world.landmarks
+        self.steps, self.step_ns = world.steps, world.step_ns
+
+    def add(self, name: str, fault: AnySensorFaultPart) -> None:
+        """One more fault, with its times from the start of the run."""
+        self._faults.append((name, fault, fault.span_ns()))
+
+    def start_belief(self, entity: str) -> tuple[Array, Array]:
+        return self._world.start_belief(entity)
+
+    def truth(self, entity: str, k: int) -> Array:
+        return self._world.truth(entity, k)
+
+    def place(self, entity: str, k: int) -> Array:
+        return self._world.place(entity, k)
+
+    def outputs(self, k: int) -> list[Output]:
+        """What is left of the data, faults applied in the order they are stated."""
+        found: list[Output] = []
+        for item in self._world.outputs(k):
+            told = self._told(item)
+            if told is not None:
+                found.append(told)
+        return found
+
+    def silenced(self, robot: str, t_ns: int) -> bool:
+        """Whether the autopilot of a robot says nothing at an instant."""
+        return any(
+            isinstance(fault, SilencePart) and fault.robot == robot and begin <= t_ns < end
+            for _, fault, (begin, end) in self._faults
+        )
+
+    def _told(self, item: Output) -> Output | None:
+        for name, fault, (begin, end) in self._faults:
+            if fault.robot != item.robot or not begin <= item.t_ns < end:
+                continue
+            if isinstance(fault, SilencePart):
+                if self._drop_silenced and self._of_autopilot(item):
+                    return None
+                continue
+            if item.kind == ODOMETRY or fault.sensor not in (None, item.sensor) or fault.of not in (None, item.of):
+                continue
+            changed = self._changed(name, fault, item)
+            if changed is None:
+                return None
+            item = changed
+        return item
+
+    def _of_autopilot(self, item: Output) -> bool:
+        return item.kind == ODOMETRY or (item.of is None and item.sensor == self._from_autopilot.get(item.robot))
+
+    def _changed(self, name: str, fault: DropoutPart | OutliersPart | BiasPart, item: Output) -> Output | None:
+        if isinstance(fault, BiasPart):
+            z = item.z.copy()
+            z[0] += fault.bias
+            return replace(item, z=_possible(item.kind, z))
+        draw = generator(self._seed, name, item.robot, item.sensor, item.of or "", str(item.t_ns))
+        if draw.random() >= fault.share:
+            return item
+        if isinstance(fault, DropoutPart):
+            return None
+        off = fault.sigmas * np.sqrt(np.diagonal(item.R)) * draw.uniform(-1.0, 1.0, len(item.z))
+        return replace(item, z=_possible(item.kind, item.z + off))
+
+
+def _possible(kind: str, z: Array) -> Array:
+    """No sensor tells a negative distance."""
+    if kind in ("range", "range_bearing") and kind in RELATIVE_ANGLES:
+        z[0] = max(z[0], 0.0)
+    return z
+
+
+def with_faults(
+    world: World,
+    faults: dict[str, AnySensorFaultPart],
+    seed: int,
+    from_autopilot: Iterable[tuple[str, str | None]],
+) -> World:
+    """The world itself if there is nothing wrong with its sensors."""
+    return FaultyWorld(world, faults, seed, dict(from_autopilot)) if faults else world
