@@ -153,6 +153,7 @@ class JointLayout:
             model.angles,
             self._transform,
             self._parameters,
+            model.turning,
         )
         nu = wrap_components(z - predicted.z, model.angles)
         noise = symmetrize(R + residual_factor * predicted.residual)
@@ -208,6 +209,7 @@ class JointLayout:
             model.angles,
             self._transform,
             self._parameters,
+            model.turning,
         )
         z = np.concatenate([item.z for item in measurements])
         m = len(z)

@@ -100,7 +100,9 @@ class TrackRules:
         cov = np.zeros((len(joint), len(joint)))
         cov[:n, :n], cov[n:, n:] = own[1], track[1]
         try:
-            seen = observe(model.h, model.jacobian, joint, cov, model.angles, "unscented", self._parameters)
+            seen = observe(
+                model.h, model.jacobian, joint, cov, model.angles, "unscented", self._parameters, model.turning
+            )
         except OutOfViewError:
             return True
         return bool(np.any(seen.residual.diagonal() > MAX_NONLINEAR * seen.cov.diagonal()))

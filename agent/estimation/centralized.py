@@ -161,6 +161,7 @@ class CentralizedFilter:
             self.cov[np.ix_(rows, rows)],
             model.angles,
             self._transform,
+            turning=model.turning,
         )
         innovation = wrap_components(z - predicted.z, model.angles)
         S = predicted.cov + R

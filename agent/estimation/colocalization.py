@@ -72,7 +72,9 @@ def absolute_update(
     (mean, cov) is the belief at the instant of the measurement. None when the posterior would not be positive
     definite.
     """
-    predicted = observe(model.h, model.jacobian, mean, cov, model.angles, options.transform, options.parameters)
+    predicted = observe(
+        model.h, model.jacobian, mean, cov, model.angles, options.transform, options.parameters, model.turning
+    )
     innovation = _innovation(predicted, z, model.angles)
     S, nis = _capped(innovation, predicted.cov + R, options.innovation_cap)
     return applied(mean, cov, layout, gain(predicted.cross, S), S, innovation, nis, predicted.H)
@@ -127,6 +129,7 @@ def sighting_update(
         model.angles,
         options.transform,
         options.parameters,
+        model.turning,
     )
     H_own, H_target = predicted.H[:, :n], predicted.H[:, n:]
     own_term, target_term = H_own @ own_cov @ H_own.T, H_target @ target_cov @ H_target.T
@@ -182,11 +185,13 @@ class StackedModel:
 
     def __init__(self, models: Sequence[RelativeModel], sizes: Sequence[int]) -> None:
         self._models = models
-        angles, row = [], 0
+        angles, turning, row = [], [], 0
         for model, size in zip(models, sizes):
             angles += [row + index for index in model.angles]
+            turning += [(row + index, column, slope) for index, column, slope in model.turning]
             row += size
         self.angles = tuple(angles)
+        self.turning = tuple(turning)
 
     def h(self, state: Array) -> Array:
         return np.concatenate([model.h(state) for model in self._models], axis=-1)
@@ -257,7 +262,9 @@ def contact(
         R[row : row + len(item.z), row : row + len(item.z)] = item.R
         row += len(item.z)
     mean = np.concatenate([initiator.belief.mean, responder.belief.mean])
-    predicted = observe(model.h, model.jacobian, mean, joint, model.angles, options.transform, options.parameters)
+    predicted = observe(
+        model.h, model.jacobian, mean, joint, model.angles, options.transform, options.parameters, model.turning
+    )
     innovation = _innovation(predicted, z, model.angles)
     S, nis = _capped(innovation, predicted.cov + R, options.innovation_cap)
     return Contact(predicted.cross[:n], predicted.cross[n:], S, innovation, cross, nis)

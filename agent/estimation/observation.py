@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from agent.estimation.gaussian import LOWEST
 from agent.estimation.motion import UNICYCLE, StateLayout
+from agent.estimation.unscented import Turning
 from agent.events import LEVEL, Observation
 from network.messages import NO_MOUNT, Measurement, Mount
 
@@ -132,6 +133,10 @@ class AbsoluteModel:
     def angles(self) -> tuple[int, ...]:
         return tuple(row for row, column in enumerate(self.components) if column == self.layout.heading)
 
+    @property
+    def turning(self) -> Turning:
+        return tuple((row, self.components[row], 1.0) for row in self.angles)
+
     def h(self, state: Array) -> Array:
         return np.asarray(state[..., list(self.components)])
 
@@ -238,6 +243,14 @@ class RelativeModel:
     @property
     def angles(self) -> tuple[int, ...]:
         return RELATIVE_ANGLES[self.kind]
+
+    @property
+    def turning(self) -> Turning:
+        """Azimuths about the vertical fall by what the observer turns; those of a tilted sensor don't quite."""
+        heading, measured = self.observer.heading, MEASURED[self.kind]
+        if heading is None or "azimuth" not in measured or not self.mount[3:5] == LEVEL == self.attitude:
+            return ()
+        return ((measured.index("azimuth"), heading, -1.0),)
 
     @property
     def _turns(self) -> bool:

@@ -20,10 +20,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import gain, square_root, symmetrize, wrap_components
+from agent.estimation.gaussian import gain, square_root, symmetrize, wrap, wrap_components
 
 Array = NDArray[np.float64]
 Transform = Literal["unscented", "linearized", "jacobian"]
+
+Turning = tuple[tuple[int, int, float], ...]
+"""(component of z, component of x, slope): angles of z that follow a heading of x all the way round."""
+
+NARROW_RAD = 1.0
+"""Sigma points that turn a heading by less than this are in no danger of being wrapped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +99,13 @@ def observe(
     angles: tuple[int, ...],
     transform: Transform = "unscented",
     parameters: UnscentedParameters = DEFAULT,
+    turning: Turning = (),
 ) -> Predicted:
-    """Predict h(x) for x ~ (mean (..., n), cov (..., n, n)); `angles` are wrapped components of z."""
+    """Predict h(x) for x ~ (mean (..., n), cov (..., n, n)); `angles` are wrapped components of z.
+
+    Sigma points of a heading that is hardly known lie turns apart. What an angle owes to one of `turning` is therefore
+    taken off before it is wrapped, and added again: wrapped with it, the angle would seem to know where x is.
+    """
     if transform == "jacobian":
         H = jacobian(mean)
         cross = cov @ H.swapaxes(-1, -2)
@@ -102,8 +113,14 @@ def observe(
     weight_mean, weight_cov, spread = weights(mean.shape[-1], parameters)
     points = sigma_points(mean, square_root(cov), spread)
     image = function(points)
-    centre = image[..., :1, :]
-    deviation = wrap_components(image - centre, angles)
+    centre, all_angles = image[..., :1, :], angles
+    deviation = image - centre
+    for row, column, slope in turning:
+        if cov[..., column, column].max() * spread**2 > NARROW_RAD**2:
+            turned = slope * (points[..., column] - mean[..., None, column])
+            deviation[..., row] = wrap(deviation[..., row] - turned) + turned
+            angles = tuple(angle for angle in angles if angle != row)
+    deviation = wrap_components(deviation, angles)
     shift = weight_mean @ deviation
     deviation -= shift[..., None, :]
     weighted = deviation.swapaxes(-1, -2) * weight_cov
@@ -111,5 +128,5 @@ def observe(
     H = gain(cross.swapaxes(-1, -2), cov)
     if transform == "linearized":
         return Predicted(centre[..., 0, :], cross, symmetrize(H @ cross), H)
-    z = wrap_components(centre[..., 0, :] + shift, angles)
+    z = wrap_components(centre[..., 0, :] + shift, all_angles)
     return Predicted(z, cross, symmetrize(weighted @ deviation), H)

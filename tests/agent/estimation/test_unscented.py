@@ -11,9 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import gain, square_root
+from agent.estimation.gaussian import (
+    gain,
+    quadratic_form,
+    square_root,
+    symmetrize,
+    wrap_components,
+    wrap_scalar,
+)
 from agent.estimation.motion import UNICYCLE, compose
-from agent.estimation.observation import RelativeModel, planar_mount
+from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, RelativeModel, planar_mount
 from agent.estimation.unscented import (
     DEFAULT,
     Transform,
@@ -197,3 +204,32 @@ def test_fifty_steps_agree_with_a_public_filter(parameters: tuple[float, float, 
         mean, cov = mean + K @ (z - found.z), cov - K @ (found.cov + R) @ K.T
         assert np.abs(mean - library.x).max() < 1e-9, f"seed 17, update {k}"
         assert np.abs(cov - library.P).max() < 1e-9, f"seed 17, update {k}"
+
+
+@pytest.mark.parametrize("kind", ["bearing", "range_bearing", "bearing3", "heading", "pose"])
+@pytest.mark.parametrize("sigma_rad", [0.5, 2.0, 10.0])
+def test_a_heading_that_is_hardly_known_does_not_make_a_place_known(kind: str, sigma_rad: float) -> None:
+    """A turn of the own body looks like nothing else: the errors after an update are as large as it claims."""
+    random = np.random.default_rng(20)
+    cov = np.diag([0.4**2, 0.6**2, sigma_rad**2])
+    landmark: tuple[float, ...] = (7.0, -3.0, 1.0) if kind == "bearing3" else (7.0, -3.0)
+    relative = kind in RELATIVE_ANGLES
+    model: RelativeModel | AbsoluteModel = (
+        AbsoluteModel(kind, UNICYCLE) if not relative else RelativeModel(kind, UNICYCLE, landmark=landmark)
+    )
+    m = len(model.h(np.zeros(3)))
+    R = 0.02**2 * np.eye(m)
+    nees = []
+    for _ in range(400):
+        truth = np.array([1.0, 2.0, 0.7])
+        mean = truth + np.sqrt(np.diagonal(cov)) * random.standard_normal(3)
+        mean[2] = wrap_scalar(float(mean[2]))
+        z = wrap_components(model.h(truth) + 0.02 * random.standard_normal(m), model.angles)
+        seen = observe(model.h, model.jacobian, mean, cov, model.angles, turning=model.turning)
+        S = seen.cov + R
+        K = gain(seen.cross, S)
+        after = mean + K @ wrap_components(z - seen.z, model.angles)
+        P = symmetrize(cov - K @ S @ K.T)
+        assert P[:2, :2].trace() <= cov[:2, :2].trace() + 1e-12
+        nees.append(float(quadratic_form(wrap_components(truth - after, (2,)), P)) / 3.0)
+    assert np.mean(nees) < 1.25
