@@ -74,6 +74,14 @@ def explain(model: type[BaseModel], data: dict[str, Any], error: ValidationError
         near = difflib.get_close_matches(str(first["loc"][-1]), names, n=1, cutoff=0.5)
         hint = f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(names)}"
         return f"unknown key '{path}': {hint}"
+    if first["type"] in ("union_tag_invalid", "union_tag_not_found"):
+        key, kinds = first["ctx"]["discriminator"].strip("'"), _tags(model, first["loc"])
+        given = value.get(key) if isinstance(value, dict) else None
+        if given is None:
+            return f"key '{path}.{key}' is missing: one of {', '.join(kinds)}"
+        near = difflib.get_close_matches(str(given), kinds, n=1, cutoff=0.5)
+        hint = f"did you mean '{near[0]}'?" if near else f"one of {', '.join(kinds)}"
+        return f"key '{path}.{key}' = {given!r}: {hint}"
     if first["type"] == "missing":
         return f"key '{path}' is missing"
     message = first["msg"][0].lower() + first["msg"][1:]
@@ -93,6 +101,9 @@ def _readable_path(data: Any, location: tuple[Any, ...]) -> str:
             here = here[key] if isinstance(here, list) and key < len(here) else None
             parts.append(str(here.get("id", key)) if isinstance(here, dict) else str(key))
         else:
+            # The tag of a union of tables is no key of the file.
+            if isinstance(here, dict) and key not in here and here.get("kind") == key:
+                continue
             here = here.get(key) if isinstance(here, dict) else None
             parts.append(str(key))
     return ".".join(parts)
@@ -100,15 +111,42 @@ def _readable_path(data: Any, location: tuple[Any, ...]) -> str:
 
 def _valid_names(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
     """Field names of the table at `location` below `model`."""
+    here = _type_at(model, location)
+    return sorted(here.model_fields) if _is_table(here) else []
+
+
+def _type_at(model: type[BaseModel], location: tuple[Any, ...]) -> Any:
+    """The type of what is at `location` below `model`."""
     here: Any = model
     for key in location:
-        if _is_table(here):
+        kinds = _kinds(here)
+        if key in kinds:
+            here = kinds[str(key)]
+        elif _is_table(here):
             field = here.model_fields.get(str(key))
             here = _required(field.annotation) if field is not None else None
         else:
             # An index or a name of free choice: on to the type of the entries.
             here = _required((get_args(here) or (None,))[-1])
-    return sorted(here.model_fields) if _is_table(here) else []
+    return here
+
+
+def _tags(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
+    """Kinds of table there may be at `location` below `model`."""
+    return list(_kinds(_type_at(model, location)))
+
+
+def _kinds(annotation: Any) -> dict[str, Any]:
+    """Tables of a union by their `kind`; empty for anything else."""
+    if get_origin(annotation) is Annotated:
+        annotation = get_args(annotation)[0]
+    if get_origin(annotation) is not UnionType:
+        return {}
+    found = {}
+    for part in get_args(annotation):
+        if _is_table(part) and "kind" in part.model_fields:
+            found[str(get_args(part.model_fields["kind"].annotation)[0])] = part
+    return found
 
 
 def _is_table(annotation: Any) -> bool:
@@ -117,6 +155,6 @@ def _is_table(annotation: Any) -> bool:
 
 def _required(annotation: Any) -> Any:
     """A type without its `| None`."""
-    if get_origin(annotation) is UnionType:
+    if get_origin(annotation) is UnionType and type(None) in get_args(annotation):
         return next(argument for argument in get_args(annotation) if argument is not type(None))
     return annotation
