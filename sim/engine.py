@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.fault_parts import AnyFaultPart
 from agent.node import Node, Outgoing, Recorder
 from agent.sensor_input import encode
 from agent.settings import NS
@@ -26,7 +27,7 @@ from sim.agents import agent_config, autopilot_fix
 from sim.bound import BoundRunner
 from sim.engine_faults import ClockChange, EngineFaults, Forged, Happening, Pause, Resume, Start, Stop
 from sim.fault_plan import trial_faults
-from sim.faulty_world import with_faults
+from sim.faulty_world import FaultyWorld
 from sim.lives import Process
 from sim.metrics import TrialTrace
 from sim.reach import Reach
@@ -85,12 +86,12 @@ class VirtualEngine:
         recorders: dict[str, Recorder] | None = None,
         fate_sink: FateSink | None = None,
     ) -> None:
-        self._faults = EngineFaults(trial_faults(scenario, seed), seed)
-        world = with_faults(world, self._faults.sensors, seed, [(r.id, autopilot_fix(r)) for r in scenario.robots])
+        world = FaultyWorld(world, seed, {robot.id: autopilot_fix(robot) for robot in scenario.robots})
         self._scenario, self._world = scenario, world
+        self._faults = EngineFaults(world, seed)
         self._heap: list[tuple[int, int, str, int, str, Any]] = []
         self._pushed = 0
-        self._now = 0
+        self._now = self._k = 0
         self._timers: dict[str, int] = {}
         self._ticked: dict[str, int] = {}
         self._processes = {
@@ -115,6 +116,8 @@ class VirtualEngine:
         self._bases: dict[tuple[str, str], Epoch] = {}
         self._traffic: Counter[str] = Counter()
         self.step_us: list[float] = []
+        for name, fault in trial_faults(scenario, seed).items():
+            self.inject(name, fault)
 
     @property
     def nodes(self) -> dict[str, Node]:
@@ -122,27 +125,51 @@ class VirtualEngine:
         return {name: process.node for name, process in self._processes.items() if process.node is not None}
 
     def run(self, progress: Callable[[int, int], None] | None = None) -> TrialResult:
-        """Play the whole scenario."""
+        """Play the whole scenario, or what is left of it."""
+        while self.step():
+            if progress is not None:
+                progress(self._k, self._world.steps)
+        return self.result()
+
+    @property
+    def t_s(self) -> float:
+        """Time played."""
+        return self._k * self._world.step_ns / NS
+
+    def step(self) -> bool:
+        """Play one step of the world; False if there is none left."""
+        if self._k == 0:
+            self._begin()
+        if self._k >= self._world.steps:
+            return False
+        self._k += 1
+        started = time.perf_counter()
+        outputs = self._world.outputs(self._k)
+        self._measured.add(outputs)
+        for item in outputs:
+            self._push(item.t_ns, int(item.phase), item.robot, item)
+        self._play(self._k)
+        self.step_us.append((time.perf_counter() - started) * 1e6 / len(self._processes))
+        if self._bound is not None:
+            self._bound.step(self._k, outputs)
+        self._sample(self._k)
+        return True
+
+    def _begin(self) -> None:
         self._publish_range(0)
-        for t_ns, robot, what in self._faults.happenings(self._processes):
-            self._push(t_ns, FAULT, robot, what)
         for robot in self._processes:
             self._arm(robot)
         self._sample(0)
-        for k in range(1, self._world.steps + 1):
-            started = time.perf_counter()
-            outputs = self._world.outputs(k)
-            self._measured.add(outputs)
-            for item in outputs:
-                self._push(item.t_ns, int(item.phase), item.robot, item)
-            self._play(k)
-            self.step_us.append((time.perf_counter() - started) * 1e6 / len(self._processes))
-            if self._bound is not None:
-                self._bound.step(k, outputs)
-            self._sample(k)
-            if progress is not None:
-                progress(k, self._world.steps)
-        return self._result()
+
+    def inject(self, name: str, fault: AnyFaultPart) -> None:
+        """One more fault, its times from the start of the run. Raises `ValueError` if the name is in use."""
+        self._faults.add(name, fault)
+        for t_ns, robot, what in self._faults.happenings(name, self._processes):
+            self._push(max(t_ns, self._now), FAULT, robot, what)
+
+    def end_fault(self, name: str) -> bool:
+        """End a fault of links or sensors now; False if there is none of that name that goes on."""
+        return self._faults.end(name, self._now)
 
     def _play(self, k: int) -> None:
         """Everything up to and including instant k. Who hears whom follows the positions at each instant."""
@@ -293,7 +320,8 @@ class VirtualEngine:
             for entity in (*self._world.robots, *self._world.targets):
                 self._sampler.put_bound(entity, row, self._bound.belief(entity))
 
-    def _result(self) -> TrialResult:
+    def result(self) -> TrialResult:
+        """Figures of what has been played."""
         refused: Counter[str] = Counter()
         for process in self._processes.values():
             refused.update(process.rejected())

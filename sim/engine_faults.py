@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from agent.clock_faults import FaultyClock
 from agent.fault_parts import (
     AnyFaultPart,
-    AnySensorFaultPart,
     BiasPart,
     ClockDriftPart,
     ClockStepPart,
@@ -24,6 +23,7 @@ from agent.settings import nanoseconds
 from network.faults import FOREVER_NS, LinkFaults
 from network.forgery import Forger
 from network.messages import Packet
+from sim.faulty_world import FaultyWorld
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,59 +64,66 @@ Happening = Stop | Start | Pause | Resume | ClockChange | Forged
 
 
 class EngineFaults:
-    """The faults of one trial by name."""
+    """The faults of one trial by name; more may be added while it is played."""
 
-    def __init__(self, faults: dict[str, AnyFaultPart], seed: int) -> None:
-        self._seed = seed
-        self._faults = faults
+    def __init__(self, world: FaultyWorld, seed: int) -> None:
+        self._world, self._seed = world, seed
+        self._faults: dict[str, AnyFaultPart] = {}
         self.links = LinkFaults(seed)
-        self.sensors: dict[str, AnySensorFaultPart] = {}
         self._clocks: dict[str, FaultyClock] = {}
         self._forgers: dict[str, list[Forger]] = {}
-        for name, fault in faults.items():
-            match fault:
-                case DropoutPart() | OutliersPart() | BiasPart() | SilencePart():
-                    self.sensors[name] = fault
-                case ClockStepPart() | ClockDriftPart():
-                    self.clock(fault.robot).add(fault.clock())
-                case ForgePart() | CrashPart() | RestartPart() | PausePart():
-                    pass
-                case _:
-                    self.links.add([fault.fault(name)])
+
+    def add(self, name: str, fault: AnyFaultPart) -> None:
+        """One more fault. Raises `ValueError` if the name is in use."""
+        if name in self._faults:
+            raise ValueError(f"there is a fault '{name}' already")
+        self._faults[name] = fault
+        match fault:
+            case DropoutPart() | OutliersPart() | BiasPart() | SilencePart():
+                self._world.add(name, fault)
+            case ClockStepPart() | ClockDriftPart():
+                self.clock(fault.robot).add(fault.clock())
+            case ForgePart() | CrashPart() | RestartPart() | PausePart():
+                pass
+            case _:
+                self.links.add([fault.fault(name)])
+
+    def end(self, name: str, t_ns: int) -> bool:
+        """End a fault of links or sensors; False if there is none of that name that goes on."""
+        return self.links.end(name, t_ns) or self._world.end(name, t_ns)
 
     def clock(self, robot: str) -> FaultyClock:
         """The clock of a robot."""
         return self._clocks.setdefault(robot, FaultyClock())
 
-    def happenings(self, robots: Iterable[str]) -> Iterator[tuple[int, str, Happening]]:
-        """(instant [ns], robot, what happens) to processes and clocks, and the first packet of every forger."""
-        for name, fault in self._faults.items():
-            begin, end = fault.span_ns()
-            match fault:
-                case CrashPart():
-                    yield begin, fault.robot, Stop()
-                    if end < FOREVER_NS:
-                        yield end, fault.robot, Start(fault.state == "kept")
-                case RestartPart():
-                    yield begin, fault.robot, Stop()
-                    yield (begin if end == FOREVER_NS else end), fault.robot, Start(True)
-                case PausePart():
-                    yield begin, fault.robot, Pause()
-                    yield begin + nanoseconds(fault.for_s), fault.robot, Resume()
-                case ForgePart():
-                    forgery = fault.forgery(name)
-                    for robot in robots:
-                        if forgery.reaches(robot):
-                            forger = Forger(forgery, self._seed, robot)
-                            self._forgers.setdefault(robot, []).append(forger)
-                            first = forger.next_ns(-1)
-                            if first is not None:
-                                yield first, robot, Forged(forger)
-                case _:
-                    pass
-        for robot, clock in self._clocks.items():
-            for t_ns in clock.changes():
-                yield t_ns, robot, ClockChange()
+    def happenings(self, name: str, robots: Iterable[str]) -> Iterator[tuple[int, str, Happening]]:
+        """(instant [ns], robot, what happens) by a fault: to processes and clocks, and a forger's first packet."""
+        fault = self._faults[name]
+        begin, end = fault.span_ns()
+        match fault:
+            case CrashPart():
+                yield begin, fault.robot, Stop()
+                if end < FOREVER_NS:
+                    yield end, fault.robot, Start(fault.state == "kept")
+            case RestartPart():
+                yield begin, fault.robot, Stop()
+                yield (begin if end == FOREVER_NS else end), fault.robot, Start(True)
+            case PausePart():
+                yield begin, fault.robot, Pause()
+                yield begin + nanoseconds(fault.for_s), fault.robot, Resume()
+            case ClockStepPart() | ClockDriftPart():
+                for t_ns in (begin, end):
+                    if t_ns < FOREVER_NS:
+                        yield t_ns, fault.robot, ClockChange()
+            case ForgePart():
+                forgery = fault.forgery(name)
+                for robot in robots:
+                    if forgery.reaches(robot):
+                        forger = Forger(forgery, self._seed, robot)
+                        self._forgers.setdefault(robot, []).append(forger)
+                        first = forger.next_ns(-1)
+                        if first is not None:
+                            yield first, robot, Forged(forger)
 
     def overheard(self, receiver: str, packet: Packet) -> None:
         """A genuine packet on its way to a receiver, for those who forge others after it."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +18,7 @@ ODOMETRY = "odometry"
 
 
 class FaultyWorld:
-    """`world` with sensor faults by name; draws are keyed by (seed, fault, robot, sensor, subject, instant).
+    """`world` with the sensor faults that are added; draws are keyed by (seed, fault, robot, sensor, subject, instant).
 
     `from_autopilot` names, by robot, the sensor whose fixes come from the autopilot, if any.
     """
@@ -27,13 +26,12 @@ class FaultyWorld:
     def __init__(
         self,
         world: World,
-        faults: dict[str, AnySensorFaultPart],
         seed: int,
         from_autopilot: dict[str, str | None],
         drop_silenced: bool = True,
     ) -> None:
         self._world, self._seed = world, seed
-        self._faults = [(name, fault, fault.span_ns()) for name, fault in faults.items()]
+        self._faults: list[tuple[str, AnySensorFaultPart, tuple[int, int]]] = []
         self._from_autopilot = from_autopilot
         self._drop_silenced = drop_silenced
         self.robots, self.targets, self.landmarks = world.robots, world.targets, world.landmarks
@@ -42,6 +40,14 @@ class FaultyWorld:
     def add(self, name: str, fault: AnySensorFaultPart) -> None:
         """One more fault, with its times from the start of the run."""
         self._faults.append((name, fault, fault.span_ns()))
+
+    def end(self, name: str, t_ns: int) -> bool:
+        """End a fault; False if there is none of that name that goes on."""
+        for index, (known, fault, (begin, end)) in enumerate(self._faults):
+            if known == name and end > t_ns:
+                self._faults[index] = (known, fault, (min(begin, t_ns), t_ns))
+                return True
+        return False
 
     def start_belief(self, entity: str) -> tuple[Array, Array]:
         return self._world.start_belief(entity)
@@ -54,6 +60,8 @@ class FaultyWorld:
 
     def outputs(self, k: int) -> list[Output]:
         """What is left of the data, faults applied in the order they are stated."""
+        if not self._faults:
+            return self._world.outputs(k)
         found: list[Output] = []
         for item in self._world.outputs(k):
             told = self._told(item)
@@ -106,13 +114,3 @@ def _possible(kind: str, z: Array) -> Array:
     if kind in ("range", "range_bearing") and kind in RELATIVE_ANGLES:
         z[0] = max(z[0], 0.0)
     return z
-
-
-def with_faults(
-    world: World,
-    faults: dict[str, AnySensorFaultPart],
-    seed: int,
-    from_autopilot: Iterable[tuple[str, str | None]],
-) -> World:
-    """The world itself if there is nothing wrong with its sensors."""
-    return FaultyWorld(world, faults, seed, dict(from_autopilot)) if faults else world

@@ -8,22 +8,23 @@ import numpy as np
 import pytest
 
 from agent.fault_parts import made
-from sim.faulty_world import FaultyWorld, with_faults
+from sim.faulty_world import FaultyWorld
 from sim.scenario_file import load
 from sim.world import Output, SimulatedWorld
 
 SCENARIO = load("fault-plan")
 
 
+def world(*faults: dict[str, Any], drop_silenced: bool = True) -> FaultyWorld:
+    found = FaultyWorld(SimulatedWorld(SCENARIO, 5), 5, {"r1": "position"}, drop_silenced)
+    for index, fault in enumerate(faults):
+        found.add(f"f{index}", made(**fault))  # type: ignore[arg-type]
+    return found
+
+
 def told(*faults: dict[str, Any], steps: range = range(1, 61), drop_silenced: bool = True) -> list[Output]:
-    world = FaultyWorld(
-        SimulatedWorld(SCENARIO, 5),
-        {f"f{index}": made(**fault) for index, fault in enumerate(faults)},  # type: ignore[misc]
-        5,
-        {"r1": "position"},
-        drop_silenced,
-    )
-    return [item for k in steps for item in world.outputs(k)]
+    faulty = world(*faults, drop_silenced=drop_silenced)
+    return [item for k in steps for item in faulty.outputs(k)]
 
 
 def key(item: Output) -> tuple[int, str, str, str | None]:
@@ -33,9 +34,11 @@ def key(item: Output) -> tuple[int, str, str, str | None]:
 CLEAN = {key(item): item for item in told()}
 
 
-def test_without_faults_the_world_is_itself() -> None:
-    world = SimulatedWorld(SCENARIO, 5)
-    assert with_faults(world, {}, 5, []) is world
+def test_a_fault_may_be_ended_while_the_world_is_played() -> None:
+    faulty = world({"kind": "sensor_dropout", "robot": "r1"})
+    assert faulty.end("f0", 5 * 10**9) and not faulty.end("f0", 5 * 10**9) and not faulty.end("f1", 0)
+    heard = [item.t_ns for k in range(1, 61) for item in faulty.outputs(k) if item.robot == "r1" and item.of]
+    assert min(heard) >= 5 * 10**9
 
 
 def test_a_dropout_takes_one_sensor_of_one_robot_for_its_time() -> None:
@@ -96,9 +99,9 @@ def test_a_silent_autopilot_tells_neither_odometry_nor_fix() -> None:
 def test_a_silenced_autopilot_may_be_left_to_who_plays_it() -> None:
     silence = {"kind": "autopilot_silence", "robot": "r1"}
     assert len(told(silence, drop_silenced=False)) == len(CLEAN)
-    world = FaultyWorld(SimulatedWorld(SCENARIO, 5), {"f": made(**silence, at_s=3.0, for_s=4.0)}, 5, {})  # type: ignore[dict-item]
-    assert [world.silenced("r1", t * 10**9) for t in (2, 3, 6, 7)] == [False, True, True, False]
-    assert not world.silenced("r2", 4 * 10**9)
+    faulty = world({**silence, "at_s": 3.0, "for_s": 4.0})
+    assert [faulty.silenced("r1", t * 10**9) for t in (2, 3, 6, 7)] == [False, True, True, False]
+    assert not faulty.silenced("r2", 4 * 10**9)
 
 
 def test_draws_do_not_depend_on_what_was_asked_before() -> None:
@@ -109,7 +112,6 @@ def test_draws_do_not_depend_on_what_was_asked_before() -> None:
 
 
 def test_the_truth_stays() -> None:
-    plain = SimulatedWorld(SCENARIO, 5)
-    faulty = FaultyWorld(plain, {"f": made(kind="sensor_bias", robot="r1", bias=1.0)}, 5, {})  # type: ignore[dict-item]
+    plain, faulty = SimulatedWorld(SCENARIO, 5), world({"kind": "sensor_bias", "robot": "r1", "bias": 1.0})
     np.testing.assert_array_equal(plain.truth("r1", 9), faulty.truth("r1", 9))
     np.testing.assert_array_equal(plain.start_belief("r1")[0], faulty.start_belief("r1")[0])
