@@ -1,0 +1,94 @@
+"""A complete example of tests of one's own fleet: what is played here may be any scenario file."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from agent.config_file import ConfigError
+from deploy.testing import FleetMaker, fleet
+
+__all__ = ["fleet"]
+
+OWN = "fault-plan"
+QUIET = "fault_plan.intensity=calm"
+
+
+def test_a_partition_is_survived_and_forgotten(fleet: FleetMaker) -> None:
+    robots = fleet(OWN, QUIET, "fault_plan.processes=false")
+    robots.run_for(8.0)
+    together = robots.status("r3")["pairs"]
+    robots.partition(["r1", "r2"], ["r3", "r4", "r5"])
+    robots.run_for(8.0)
+    assert robots.status("r3")["pairs"]["r1"] <= together["r1"] + 2_000_000_000
+    robots.heal()
+    robots.run_for(10.0)
+    assert robots.status("r3")["pairs"]["r1"] > 16_000_000_000
+    robots.assert_consistent()
+
+
+def test_a_killed_robot_is_gone_and_comes_back(fleet: FleetMaker) -> None:
+    robots = fleet(OWN, QUIET, seed=3)
+    robots.run_for(6.0)
+    robots.kill("r3", for_s=6.0, state="lost")
+    robots.run_for(3.0)
+    assert robots.status("r3") == {} and math.isnan(robots.error_m("r3"))
+    robots.run_for(12.0)
+    assert robots.status("r3")["state"] == "running" and robots.error_m("r3") < 3.0
+    robots.assert_consistent()
+
+
+def test_a_link_gets_worse_and_better(fleet: FleetMaker) -> None:
+    robots = fleet(OWN, QUIET)
+    link = robots.link("r2", "r1")
+    robots.run_for(4.0)
+    link.loss, link.delay_s = 1.0, 0.2
+    assert robots.link("r1", "r2").loss == 1.0
+    robots.run_for(6.0)
+    silent_since = robots.status("r2")["pairs"]["r1"]
+    assert silent_since < 6_000_000_000
+    link.loss = 0.0
+    robots.run_for(6.0)
+    assert robots.status("r2")["pairs"]["r1"] > silent_since
+    assert link.loss == 0.0 and link.delay_s == 0.2
+
+
+def test_pauses_sensor_faults_and_isolation_leave_the_fleet_honest(fleet: FleetMaker) -> None:
+    robots = fleet(OWN, QUIET, seed=2)
+    robots.run_for(5.0)
+    robots.pause("r2", for_s=4.0)
+    robots.inject("sensor_dropout", robot="r1", sensor="position", for_s=10.0)
+    robots.isolate("r4", for_s=5.0)
+    robots.restart("r5")
+    robots.run_for(25.0)
+    assert robots.t_s == 30.0
+    robots.assert_consistent()
+
+
+def test_two_fleets_of_one_seed_are_the_same(fleet: FleetMaker) -> None:
+    one, two = fleet(OWN, seed=9), fleet(OWN, seed=9)
+    for robots in (one, two):
+        robots.run_for(10.0)
+        robots.kill("r1", for_s=2.0)
+        robots.run_for(10.0)
+    assert [one.error_m(robot) for robot in one.robots] == [two.error_m(robot) for robot in two.robots]
+
+
+def test_what_makes_no_sense_is_refused_with_the_remedy(fleet: FleetMaker) -> None:
+    robots = fleet(OWN)
+    with pytest.raises(ConfigError, match="there are: r1, r2"):
+        robots.kill("r9")
+    with pytest.raises(KeyError, match="r9"):
+        robots.link("r1", "r9")
+    with pytest.raises(ConfigError, match="share"):
+        robots.inject("loss", share=2.0)
+    with pytest.raises(ConfigError, match="kind"):
+        robots.inject("earthquake")
+
+
+def test_an_overconfident_robot_is_found(fleet: FleetMaker) -> None:
+    robots = fleet(OWN, QUIET)
+    robots.run_for(5.0)
+    with pytest.raises(AssertionError, match=r"overconfident.*seed 1"):
+        robots.assert_consistent(limit=0.01)
