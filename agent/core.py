@@ -20,11 +20,14 @@ from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError, absolu
 from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received, Tick
 from agent.forms import build_filter
 from agent.settings import AgentSettings
-from agent.timeline import Item, OdometryTrack, Phase, Timeline
+from agent.timeline import MAX_INCREMENTS, MAX_WAITING, Item, OdometryTrack, Phase, Timeline
 from agent.waiting_filter import WaitingFilter
 from network.messages import PairReply, PairRequest, SplitReply, SplitRequest, StartRequest
 
 Array = NDArray[np.float64]
+
+MAX_KINDS = 64
+"""Kinds of measurements that figures are kept of: kinds of fixes, landmarks, sightings and contacts."""
 
 
 @dataclass(slots=True)
@@ -81,6 +84,14 @@ class Agent:
         if tracks != self._tracks:
             effects.extend(Alarm("track_ended", target) for target in self._tracks if target not in tracks)
             self._tracks = tracks
+
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """What waits or is kept, and the most there may be of it, by name."""
+        return {
+            "timeline": (len(self._timeline), MAX_WAITING),
+            "odometry": (len(self._odometry), MAX_INCREMENTS),
+            "figures": (len(self.nis), MAX_KINDS),
+        }
 
     def missing(self) -> tuple[str, ...]:
         """What the robot waits for before it starts, in words; nothing once it has."""

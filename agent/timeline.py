@@ -74,6 +74,9 @@ class OdometryTrack:
         self._increments: deque[Odometry] = deque()
         self._gap_ns: tuple[int, int] | None = None
 
+    def __len__(self) -> int:
+        return len(self._increments)
+
     def copy(self) -> OdometryTrack:
         """A track of its own with the same increments."""
         other = OdometryTrack(self._coast, self._tolerance_ns, self._counters)

@@ -28,6 +28,7 @@ from sim.bound import BoundRunner
 from sim.engine_faults import ClockChange, EngineFaults, Forged, Happening, Pause, Resume, Start, Stop
 from sim.fault_plan import trial_faults
 from sim.faulty_world import FaultyWorld
+from sim.invariants import InvariantChecker
 from sim.lives import Process
 from sim.metrics import TrialTrace
 from sim.reach import Reach
@@ -85,7 +86,9 @@ class VirtualEngine:
         with_bound: bool = False,
         recorders: dict[str, Recorder] | None = None,
         fate_sink: FateSink | None = None,
+        checker: InvariantChecker | None = None,
     ) -> None:
+        self._checker = checker
         world = FaultyWorld(world, seed, {robot.id: autopilot_fix(robot) for robot in scenario.robots})
         self._scenario, self._world = scenario, world
         self._faults = EngineFaults(world, seed)
@@ -190,7 +193,7 @@ class VirtualEngine:
                 del self._timers[robot]
                 self._ticked[robot] = t_ns
                 if process.node is not None and process.runs:
-                    self._carry_out(robot, process.node.on_tick(process.clock.local_ns(t_ns)))
+                    self._carry_out(process.node, "a timer", process.node.on_tick(process.clock.local_ns(t_ns)))
             self._note_contacts(process)
         if self._now < end:
             self._publish_range(k)
@@ -212,13 +215,15 @@ class VirtualEngine:
             t0_ns=None if item.t0_ns is None else local_ns(item.t0_ns),
             attitude=item.attitude,
         )
-        self._carry_out(process.robot, process.node.on_sensor(local_ns(self._now), payload))
+        what = f"{item.kind} of {item.of or 'itself'} by {item.sensor}"
+        self._carry_out(process.node, what, process.node.on_sensor(local_ns(self._now), payload))
 
     def _arrived(self, process: Process, packet: Packet) -> None:
         if process.node is None or not process.runs:
             process.keep_packet(packet)
             return
-        self._carry_out(process.robot, process.node.on_packet(process.clock.local_ns(self._now), packet))
+        what = f"a packet of {packet.source} on {packet.channel}"
+        self._carry_out(process.node, what, process.node.on_packet(process.clock.local_ns(self._now), packet))
 
     def _happen(self, process: Process, what: Happening) -> None:
         """A fault of a process or clock, or a forged packet."""
@@ -262,10 +267,13 @@ class VirtualEngine:
                 self._bases[robot, peer] = epoch
                 self.contacts.append((self._now / NS, robot, peer))
 
-    def _carry_out(self, robot: str, out: Outgoing) -> None:
+    def _carry_out(self, node: Node, event: str, out: Outgoing) -> None:
+        """What a robot makes of an event."""
+        if self._checker is not None:
+            self._checker.after(node, self._now, event, out)
         for packet in out.packets:
             self._transmit(packet)
-        self._arm(robot)
+        self._arm(node.robot)
 
     def _transmit(self, packet: Packet) -> None:
         header = peek_header(packet.payload)

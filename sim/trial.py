@@ -7,6 +7,7 @@ from collections.abc import Callable
 from agent.config_file import ConfigError
 from agent.node import Recorder
 from sim.engine import FateSink, TrialResult, VirtualEngine
+from sim.invariants import InvariantChecker
 from sim.recorded_world import RecordedWorld
 from sim.recordings.recording import RecordingError
 from sim.scenario import Scenario
@@ -32,8 +33,11 @@ def run_trial(
     fate_sink: FateSink | None = None,
     progress: Callable[[int, int], None] | None = None,
     world: World | None = None,
+    checker: InvariantChecker | None = None,
 ) -> TrialResult:
-    """Play one trial; equal arguments give equal results."""
+    """Play one trial; equal arguments give equal results. Raises `InvariantBreach` if a `checker` finds one."""
     world = world if world is not None else open_world(scenario, seed)
-    engine = VirtualEngine(scenario, world, seed, with_bound=with_bound, recorders=recorders, fate_sink=fate_sink)
+    engine = VirtualEngine(
+        scenario, world, seed, with_bound=with_bound, recorders=recorders, fate_sink=fate_sink, checker=checker
+    )
     return engine.run(progress)
