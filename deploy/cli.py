@@ -80,6 +80,7 @@ def parser() -> Parser:
             "--set", action="append", default=[], metavar="KEY=VALUE", help="override a key, e.g. links.loss=0.3"
         )
         command.add_argument("--bound", action="store_true", help="also run the centralized filter on the same data")
+        command.add_argument("--check", action="store_true", help="check invariants after every event (virtual time)")
         command.add_argument("--out", type=Path, help="run directory (default: runs/NAME-TIME)")
         command.add_argument("--json", action="store_true", help="print summary.json alone on standard output")
         command.add_argument("--duration", type=_seconds, metavar="S", help="play only so many seconds")

@@ -84,13 +84,14 @@ def _plan(options: argparse.Namespace) -> tuple[Path, list[Series]]:
         world = open_world(own, options.seed)
         command = ["montecarlo", options.scenario, "--trials", str(options.trials), "--seed", str(options.seed)]
         command += ["--bound"] if options.bound else []
+        command += ["--check"] if options.check else []
         command += ["--duration", f"{options.duration:g}"] if options.duration is not None else []
         for override in (*options.set, *overrides):
             command += ["--set", override]
-        made = provenance(own, options.seed, options.bound)
+        made = provenance(own, options.seed, options.bound, options.check)
         simulated_s = world.steps * world.step_ns / NS
         planned.append(Series(name, own, Path(), made, command if name else options.arguments, simulated_s))
-    whole = provenance(scenario, options.seed, options.bound)
+    whole = provenance(scenario, options.seed, options.bound, options.check)
     if varied:
         whole["vary"] = [item.key for item in varied]
     top = _directory(options, scenario.name, whole)
@@ -141,7 +142,7 @@ def _play(options: argparse.Namespace, planned: list[Series], stores: list[Trial
     pace = Pace(jobs)
     with (
         TrialProgress(len(planned) * options.trials, pace) as progress,
-        Workers([series.scenario for series in planned], jobs) as workers,
+        Workers([series.scenario for series in planned], jobs, options.check) as workers,
     ):
         for index, (series, store) in enumerate(zip(planned, stores, strict=True)):
             progress.title = series.name or series.scenario.name
@@ -261,4 +262,5 @@ def _replay(series: Series, seed: int, options: argparse.Namespace) -> str:
     """The command that plays one trial alone."""
     scenario = str(series.run_dir / "scenario.toml")
     command = ["cofix", "run", scenario, "--runtime", "virtual", "--seed", str(seed)]
-    return shlex.join([*command, *(["--bound"] if options.bound else [])])
+    flags = [*(["--bound"] if options.bound else []), *(["--check"] if options.check else [])]
+    return shlex.join([*command, *flags])

@@ -28,6 +28,7 @@ from deploy.status import LiveTable, Progress, print_summary
 from network.links import FateRecord
 from sim.agents import agent_config, table
 from sim.engine import TrialResult
+from sim.invariants import InvariantBreach, InvariantChecker
 from sim.scenario import Scenario
 from sim.scenario_file import load
 from sim.store import load_trace, save_trace
@@ -44,6 +45,8 @@ def run(options: argparse.Namespace) -> int:
     runtime = options.runtime or ("processes" if name == DEMO else "virtual")
     if runtime == "virtual" and options.speed != 1.0:
         raise ConfigError("--speed is for --runtime processes; virtual time runs as fast as it can")
+    if runtime == "processes" and options.check:
+        raise ConfigError("--check is for --runtime virtual: it looks into all robots after every event")
     speed = options.speed if name != DEMO or options.speed != 1.0 else DEMO_SPEED
     world = open_world(scenario, options.seed)
     run_dir = new_run_dir(options.out, scenario.name)
@@ -53,7 +56,11 @@ def run(options: argparse.Namespace) -> int:
     messages: list[str] = []
     lag_max_s = lag_p99_s = 0.0
     if runtime == "virtual":
-        result = _run_virtual(scenario, options, world, run_dir)
+        try:
+            result = _run_virtual(scenario, options, world, run_dir)
+        except InvariantBreach as breach:
+            print(f"cofix: invariant broken: {breach}", file=sys.stderr)
+            return 1
     else:
         launcher = Launcher(scenario, world, options.seed, speed, run_dir)
         live = LiveTable(scenario, speed, quiet=options.json)
@@ -198,6 +205,9 @@ def _run_virtual(scenario: Scenario, options: argparse.Namespace, world: Any, ru
         fates = csv.writer(file)
         fates.writerow(FATE_COLUMNS)
 
+        replay = shlex.join(["cofix", *options.arguments])
+        checker = InvariantChecker(options.seed, replay) if options.check else None
+
         def log_fate(record: FateRecord) -> None:
             fates.writerow(fate_row(record))
 
@@ -209,6 +219,7 @@ def _run_virtual(scenario: Scenario, options: argparse.Namespace, world: Any, ru
             fate_sink=log_fate,
             progress=progress.update,
             world=world,
+            checker=checker,
         )
     writer.close()
     return result

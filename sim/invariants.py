@@ -47,9 +47,8 @@ class InvariantBreach(AssertionError):
 
     def __init__(self, rule: str, robot: str, seed: int, t_ns: int, event: str, what: str, replay: str) -> None:
         self.rule, self.robot, self.seed, self.t_ns = rule, robot, seed, t_ns
-        super().__init__(
-            f"{rule}: {robot} at {t_ns * 1e-9:.6f} s, after {event}: {what}; seed {seed}, replay it with: {replay}"
-        )
+        again = f", replay it with: {replay}" if replay else ""
+        super().__init__(f"{rule}: {robot} at {t_ns * 1e-9:.6f} s, after {event}: {what}; seed {seed}{again}")
 
 
 @dataclass(slots=True, eq=False)
@@ -67,9 +66,9 @@ class _Life:
 
 
 class InvariantChecker:
-    """Checks the robots of one run; `replay` is the command line that plays it again."""
+    """Checks the robots of one run; `replay` is the command line that plays it again, if somebody knows it."""
 
-    def __init__(self, seed: int, replay: str) -> None:
+    def __init__(self, seed: int, replay: str = "") -> None:
         self._seed, self._replay = seed, replay
         self._lives: dict[str, _Life] = {}
         self.checked = 0

@@ -19,6 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from sim.invariants import InvariantChecker
 from sim.scenario import Scenario
 from sim.summary import reduce
 from sim.trial import run_trial
@@ -51,12 +52,14 @@ class Finished:
 
 _scenarios: list[Scenario] = []
 """In a worker: what the trials are of; sent once, not with every trial."""
+_checked: list[bool] = []
 
 
-def _begin(scenarios: list[Scenario], parent: int) -> None:
+def _begin(scenarios: list[Scenario], check: bool, parent: int) -> None:
     """In a worker: leave interrupts to the parent, and end when it is gone, however it went."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _scenarios.extend(scenarios)
+    _checked.append(check)
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -67,14 +70,15 @@ def _begin(scenarios: list[Scenario], parent: int) -> None:
 
 
 def _at_worker(which: int, task: Task) -> Finished:
-    return _one(_scenarios[which], task)
+    return _one(_scenarios[which], task, _checked[-1])
 
 
-def _one(scenario: Scenario, task: Task) -> Finished:
+def _one(scenario: Scenario, task: Task, check: bool) -> Finished:
     seed, with_bound = task
     started = time.perf_counter()
+    checker = InvariantChecker(seed) if check else None
     try:
-        reduced = reduce(scenario, run_trial(scenario, seed, with_bound=with_bound))
+        reduced = reduce(scenario, run_trial(scenario, seed, with_bound=with_bound, checker=checker))
     except Exception as error:
         return Finished(seed, time.perf_counter() - started, error=_told(error))
     # One figure per trial is enough for the summary; thousands of steps would only be carried about.
@@ -90,10 +94,13 @@ def _told(error: Exception) -> str:
 
 
 class Workers:
-    """Processes that play trials of any of `scenarios`; with one job everything happens in this process."""
+    """Processes that play trials of any of `scenarios`; with one job everything happens in this process.
 
-    def __init__(self, scenarios: list[Scenario], jobs: int) -> None:
-        self._scenarios, self.jobs = scenarios, jobs
+    With `check` a trial that breaks an invariant fails.
+    """
+
+    def __init__(self, scenarios: list[Scenario], jobs: int, check: bool = False) -> None:
+        self._scenarios, self.jobs, self._check = scenarios, jobs, check
         self._pool: ProcessPoolExecutor | None = None
         self._others = multiprocessing.active_children()
 
@@ -104,7 +111,7 @@ class Workers:
         """
         if self.jobs <= 1:
             for task in tasks:
-                yield _one(self._scenarios[which], task)
+                yield _one(self._scenarios[which], task, self._check)
             return
         waiting = list(reversed(list(tasks)))
         pending: list[Future[Finished]] = []
@@ -131,7 +138,7 @@ class Workers:
                     self.jobs,
                     mp_context=multiprocessing.get_context("spawn"),
                     initializer=_begin,
-                    initargs=(self._scenarios, os.getpid()),
+                    initargs=(self._scenarios, self._check, os.getpid()),
                 )
             return self._pool.submit(_at_worker, which, task)
         finally:

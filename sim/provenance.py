@@ -33,12 +33,13 @@ DRAWING = (
 """Files of `sim` that look at figures only when they are there."""
 
 
-def provenance(scenario: Scenario, seed: int, with_bound: bool) -> dict[str, Any]:
-    """Everything a trial follows from, as plain JSON values."""
+def provenance(scenario: Scenario, seed: int, with_bound: bool, checked: bool = False) -> dict[str, Any]:
+    """Everything a trial follows from, as plain JSON values; `checked`: no invariant was broken in it."""
     made = {
         "scenario": table(scenario),
         "seed": seed,
         "bound": with_bound,
+        **({"check": True} if checked else {}),
         "software": {
             "cofix": SOFTWARE,
             "code": _code(),

@@ -297,7 +297,7 @@ def test_the_centralized_filter_is_played_once_per_seed(
 
     asked: list[tuple[float, str, bool]] = []
 
-    def noted(scenario: Any, seed: int, *, with_bound: bool) -> Any:
+    def noted(scenario: Any, seed: int, *, with_bound: bool, checker: Any) -> Any:
         asked.append((scenario.links.loss, scenario.localization.transform, with_bound))
         return run_trial(scenario, seed, with_bound=with_bound)
 
@@ -368,3 +368,15 @@ def test_without_a_terminal_progress_is_a_line_at_times(capsys: pytest.CaptureFi
 )
 def test_durations_are_told_in_a_unit_people_read(seconds: float, told: str) -> None:
     assert duration(seconds) == told
+
+
+def test_a_broken_invariant_fails_the_trial_and_says_how_to_see_it(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    from sim import invariants
+
+    monkeypatch.setattr(invariants, "MAX_PEERS", 0)
+    status, _, err = desk(*SHORT, "--trials", "1", "--jobs", "1", "--check", "--out", "broken")
+    assert status == 1 and "InvariantBreach: bounds: r" in err
+    replay = shlex.split(err.split("replay it: ")[1].splitlines()[0])
+    assert "--check" in replay
+    assert main([*replay[1:], "--out", "again"]) == 1
+    assert desk(*SHORT, "--trials", "1", "--jobs", "1", "--out", "unchecked")[0] == 0
