@@ -35,6 +35,7 @@ from agent.config_parts import (
     NetworkPart,
     OdometryPart,
     SensorKind,
+    StatePart,
     TeamMemberPart,
 )
 from agent.estimation.motion import LAYOUTS
@@ -158,6 +159,7 @@ class AgentConfig(Part):
     lateness: LatenessPart = LatenessPart()
     coast: CoastPart = CoastPart()
     network: NetworkPart = NetworkPart()
+    state: StatePart = StatePart()
     sensors: dict[str, AgentSensorPart] = {}
     targets: list[AgentTargetPart] = []
     landmarks: list[LandmarkPart] = []

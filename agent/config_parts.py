@@ -119,6 +119,14 @@ class CoastPart(Part):
         return CoastSettings(self.speed_mps, self.yaw_rate_radps)
 
 
+class StatePart(Part):
+    """The file kept across starts: how often it is written, whether to the disk itself, until what age it is used."""
+
+    interval_s: Positive = 1.0
+    sync: bool = True
+    max_age_s: Positive = 600.0
+
+
 class NetworkPart(Part):
     hello_period_s: Positive = 0.5
     silent_after_s: Positive = 3.0

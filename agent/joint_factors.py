@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf
 
 from agent.belief import CorrelationStack, Part, RobotState, Transition
-from agent.estimation.colocalization import Contact, Update, applied
+from agent.estimation.colocalization import Contact, Update, applied, block_diagonal
 from agent.estimation.gaussian import (
     clip_canonical_correlations,
     gain,
@@ -41,7 +41,7 @@ from agent.estimation.motion import STATES, StateLayout
 from agent.estimation.observation import AbsoluteModel, RelativeModel, relative_model
 from agent.events import Observation
 from agent.factor_model import LONGEST, AnySnapshot
-from agent.joint_layout import JointLayout, block_diagonal
+from agent.joint_layout import JointLayout
 from agent.settings import AgentSettings
 from network.messages import (
     MAX_LINES,

@@ -14,11 +14,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.colocalization import StackedModel
+from agent.estimation.colocalization import block_diagonal, stacked
 from agent.estimation.gaussian import quadratic_form, symmetrize, wrap_components
 from agent.estimation.motion import STATES, StateLayout
-from agent.estimation.observation import AbsoluteModel, RelativeModel, relative_model
+from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.estimation.unscented import observe
+from agent.estimation.wide_heading import by_angles
 from agent.settings import AgentSettings
 from network.messages import Measurement
 
@@ -145,6 +146,7 @@ class JointLayout:
     ) -> Innovation:
         """An own measurement of the components `part`; the second-order residual is charged `residual_factor` times."""
         square = (part, part) if isinstance(part, slice) else np.ix_(part, part)
+        model, z, R = by_angles(model, z, R, cov)
         predicted = observe(
             model.h,
             model.jacobian,
@@ -193,8 +195,7 @@ class JointLayout:
         target; infinite, the targets are left out.
         """
         observer, subject = STATES[i.model], STATES[j.model]
-        models = [relative_model(item, observer, subject) for item in measurements]
-        model = models[0] if len(models) == 1 else StackedModel(models, [len(item.z) for item in measurements])
+        model, z, own_R = stacked(measurements, observer, subject, i.cov)
         a, b = observer.dim, subject.dim
         both = np.zeros((a + b, a + b))
         both[:a, :a], both[a:, a:] = i.cov[:a, :a], j.cov[:b, :b]
@@ -211,7 +212,6 @@ class JointLayout:
             self._parameters,
             model.turning,
         )
-        z = np.concatenate([item.z for item in measurements])
         m = len(z)
         rows = [wrap_components(z - predicted.z, model.angles)]
         theirs = dict(_targets(j)) if math.isfinite(same_m2) else {}
@@ -219,7 +219,7 @@ class JointLayout:
         size = m + sum(block.stop - block.start for block, _, _ in shared)
         H_i, H_j, R = np.zeros((size, len(i.mean))), np.zeros((size, len(j.mean))), np.zeros((size, size))
         H_i[:m, :a], H_j[:m, :b] = predicted.H[:, :a], predicted.H[:, a:]
-        noise = symmetrize(block_diagonal([item.R for item in measurements]) + residual_factor * predicted.residual)
+        noise = symmetrize(own_R + residual_factor * predicted.residual)
         R[:m, :m], _, nis = self._capped(rows[0], predicted.H @ both @ predicted.H.T + noise, noise)
         row = m
         for mine, other, name in shared:
@@ -245,16 +245,4 @@ def _targets(belief: JointBelief) -> list[tuple[tuple[str, str], slice]]:
         end = begin + STATES[target[1]].dim
         found.append((target, slice(begin, end)))
         begin = end
-    return found
-
-
-def block_diagonal(blocks: Sequence[Array]) -> Array:
-    """Square blocks on the diagonal of a matrix."""
-    if len(blocks) == 1:
-        return blocks[0]
-    size = sum(len(block) for block in blocks)
-    found, row = np.zeros((size, size)), 0
-    for block in blocks:
-        found[row : row + len(block), row : row + len(block)] = block
-        row += len(block)
     return found

@@ -1,14 +1,15 @@
 """Boundary recording: every event that enters a core and every effect that leaves it, in one MCAP file.
 
 A recording holds the agent's configuration too, so it can be played back into a core anywhere; on one machine
-the effects come out bit for bit the same. Topics: `<robot>/events`, `<robot>/effects`, message encoding msgpack.
+the effects come out bit for bit the same. Topics: `<robot>/events`, `<robot>/effects`, and `<robot>/lives` for starts
+after the first; message encoding msgpack.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -22,8 +23,9 @@ from agent import effects as effect_types
 from agent import events as event_types
 from agent.config import AgentConfig
 from agent.core import Agent
-from agent.effects import Effect
+from agent.effects import Effect, Estimate
 from agent.events import Event
+from agent.saved_state import restarted
 from network import messages as message_types
 
 _TYPES: dict[str, type] = {
@@ -101,6 +103,10 @@ class RecordingWriter:
             f"agent/{robot}", {"config": json.dumps(config.model_dump()), "start_ns": str(start_ns)}
         )
 
+    def begin_life(self, robot: str, t_ns: int, saved: Estimate | None) -> None:
+        """The robot has started again, with the estimate it had saved or with none."""
+        self._add(f"{robot}/lives", t_ns, msgpack.packb(_plain(saved)))
+
     def record(self, robot: str, event: Event, effects: list[Effect]) -> None:
         """One call of a core."""
         self._add(f"{robot}/events", event.t_ns, pack(event))
@@ -151,10 +157,25 @@ def read_agents(path: Path, unfinished: bool = False) -> dict[str, tuple[AgentCo
 
 
 def read_boundary(path: Path, robot: str, unfinished: bool = False) -> Iterator[tuple[Event, list[bytes]]]:
-    """Events of a robot in order, each with the packed effects that followed it.
+    """Events of a robot in order, over all its lives, each with the packed effects that followed it.
 
     `unfinished` accepts a file whose writer was killed and yields what is in it. Raises `RecordingError`.
     """
+    for what in read_lives(path, robot, unfinished):
+        if isinstance(what, tuple):
+            yield what
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Life:
+    """A robot's start after the first: the instant it was made at, and the estimate it had saved."""
+
+    t_ns: int
+    saved: Estimate | None
+
+
+def read_lives(path: Path, robot: str, unfinished: bool = False) -> Iterator[Life | tuple[Event, list[bytes]]]:
+    """What `read_boundary` tells, and between that the starts after the first."""
     topics: dict[int, str] = {}
     event: Event | None = None
     followed: list[bytes] = []
@@ -163,12 +184,16 @@ def read_boundary(path: Path, robot: str, unfinished: bool = False) -> Iterator[
             topics[record.id] = record.topic
         elif isinstance(record, Message):
             topic = topics.get(record.channel_id)
-            if topic == f"{robot}/events":
+            if topic == f"{robot}/effects":
+                followed.append(record.data)
+            elif topic in (f"{robot}/events", f"{robot}/lives"):
                 if event is not None:
                     yield event, followed
-                event, followed = _event(path, record.data), []
-            elif topic == f"{robot}/effects":
-                followed.append(record.data)
+                event, followed = None, []
+                if topic == f"{robot}/events":
+                    event = _event(path, record.data)
+                else:
+                    yield Life(record.log_time, _object(msgpack.unpackb(record.data)))
     if event is not None:
         yield event, followed
 
@@ -194,7 +219,12 @@ def replay(path: Path, robot: str) -> tuple[int, int, int | None]:
     config, start_ns = agents[robot]
     agent = Agent(config.settings(start_ns))
     events = effects = 0
-    for event, recorded in read_boundary(path, robot):
+    for what in read_lives(path, robot):
+        if isinstance(what, Life):
+            settings = config.settings(start_ns)
+            agent = Agent(settings if what.saved is None else restarted(settings, what.saved))
+            continue
+        event, recorded = what
         made = [pack(effect) for effect in agent.handle(event)]
         if made != recorded:
             return events, effects, events
@@ -203,14 +233,18 @@ def replay(path: Path, robot: str) -> tuple[int, int, int | None]:
     return events, effects, None
 
 
-def merge(paths: dict[str, Path], target: Path) -> None:
-    """Write the recordings of several robots into one file."""
+def merge(paths: dict[str, list[Path]], target: Path) -> None:
+    """Write the recordings of several robots, one for each of their lives, into one file."""
     writer = RecordingWriter(target)
-    for robot, path in paths.items():
-        known = read_agents(path, unfinished=True).get(robot)
+    for robot, lives in paths.items():
+        known = next((found for path in lives if (found := read_agents(path, unfinished=True).get(robot))), None)
         if known is None:
             continue
         writer.add_robot(*known)
-        for event, packed in read_boundary(path, robot, unfinished=True):
-            writer.record(robot, event, [unpack(data) for data in packed])
+        for path in lives:
+            for what in read_lives(path, robot, unfinished=True):
+                if isinstance(what, Life):
+                    writer.begin_life(robot, what.t_ns, what.saved)
+                else:
+                    writer.record(robot, what[0], [unpack(data) for data in what[1]])
     writer.close()

@@ -32,7 +32,10 @@ from agent.lateness_figures import LatenessFigures
 from agent.mavlink import MavlinkError, MavlinkLink
 from agent.node import Node, Outgoing, rejected
 from agent.recording import RecordingWriter
-from agent.state_file import next_incarnation
+from agent.saved_state import StateError, restarted, usable
+from agent.settings import AgentSettings, nanoseconds
+from agent.state_file import Found, StateFile
+from agent.state_keeper import StateKeeper
 from network.injected_transport import LinkInjector
 from network.link_feed import LinkFeed
 from network.links import FateRecord, LinkModel, RangeTable
@@ -80,7 +83,9 @@ class AgentShell:
         self._lags = LatenessFigures()
         self._stop = asyncio.Event()
         self.counters: Counter[str] = Counter()
-        self._incarnation = 1
+        self._state = StateFile(self._state_dir, self.robot, config.state.sync)
+        self._found = Found(1)
+        self._keeper: StateKeeper | None = None
         self._fates: Any = None
         self._fate_file: Any = None
 
@@ -109,10 +114,12 @@ class AgentShell:
             await self._control.connect(config.control_socket)
         try:
             self._state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
-            counted = config.identity.incarnation
-            self._incarnation = counted or next_incarnation(self._state_dir, time.time_ns())
+            self._found = self._state.begin(time.time_ns(), config.identity.incarnation)
         except OSError as error:
             raise ConfigError(f"state_dir {self._state_dir} cannot be written: {error.strerror}") from None
+        if self._found.refused is not None:
+            self.counters[f"state.{self._found.refused}"] += 1
+            log.warning("the state file is refused: %s; it is kept as state.refused", self._found.refused)
         if config.zenoh.insecure_lan:
             log.warning("zenoh.insecure_lan: messages to peers are neither encrypted nor authenticated")
         self._boot_id = secrets.randbits(53)
@@ -193,11 +200,14 @@ class AgentShell:
         if config.recording is not None:
             self._recording = RecordingWriter(Path(config.recording))
             self._recording.add_robot(config, start_ns)
+        settings = self._settings(start_ns)
+        if self._recording is not None and settings.found_out:
+            self._recording.begin_life(self.robot, self._clock.now_ns(), self._found.estimate)
         self._node = Node(
-            config.settings(start_ns),
+            settings,
             config.network.settings(config.lateness.horizon_s),
             boot_id=self._boot_id,
-            incarnation=self._incarnation,
+            incarnation=self._found.incarnation,
             software=SOFTWARE,
             sensors=config.sensor_configs(),
             recorder=self._record if self._recording is not None else None,
@@ -208,6 +218,22 @@ class AgentShell:
             await self._mavlink.start()
             await self._reached(config.mavlink.endpoint)
         self._arm()
+
+    def _settings(self, start_ns: int) -> AgentSettings:
+        """Those of the file; after a restart, with what the robot last knew of itself."""
+        settings, found = self.config.settings(start_ns), self._found.estimate
+        self._keeper = StateKeeper(self._state, nanoseconds(self.config.state.interval_s), self.counters)
+        if found is None:
+            return settings
+        try:
+            # A run's clock starts a little after the barrier, and before that nothing is late or early.
+            usable(settings, found, max(self._clock.now_ns(), start_ns), nanoseconds(self.config.state.max_age_s))
+        except StateError as error:
+            self.counters[f"state.{error.reason}"] += 1
+            log.warning("the saved estimate is not used: %s", error.reason)
+            return settings
+        self.counters["state.used"] += 1
+        return restarted(settings, found)
 
     async def _reached(self, endpoint: str) -> None:
         """A stream must be there at the start, for a wrong address must not go unnoticed; later it is redialled."""
@@ -268,6 +294,8 @@ class AgentShell:
         for alarm in out.alarms:
             self._warn(alarm)
         if out.estimates:
+            assert self._keeper is not None
+            self._keeper.published(out.estimates[-1])
             wall = time.monotonic()
             if wall - self._published_s >= PUBLISH_INTERVAL_S:
                 self._published_s = wall
@@ -304,6 +332,7 @@ class AgentShell:
         status: dict[str, Any] = {"robot": self.robot, **agent.status()}
         status["peers"] = {peer.peer: peer.up for peer in self._node.endpoint.peers()}
         status["rejected"] = rejected(self._node)
+        status["state_file"] = dict(self.counters)
         status["lag_max_s"] = self._lags.max_ns * 1e-9
         injection = self.config.injection
         status["injected"] = injection.links.model_dump(exclude_defaults=True) if injection is not None else {}
@@ -343,6 +372,8 @@ class AgentShell:
             self._recording.close()
         if self._fate_file is not None:
             self._fate_file.close()
+        if self._keeper is not None:
+            await self._keeper.close()
         if self._control is not None:
             if figures is not None:
                 self._control.say({"done": figures})

@@ -146,6 +146,6 @@ def merge_fates(scenario: Scenario, run_dir: Path) -> None:
 def merge_recordings(scenario: Scenario, run_dir: Path) -> None:
     """One `recording.mcap` for the run; an agent that was killed leaves what it had written."""
     paths = {robot.id: run_dir / "agents" / f"{robot.id}.mcap" for robot in scenario.robots}
-    merge({robot: path for robot, path in paths.items() if path.exists()}, run_dir / "recording.mcap")
+    merge({robot: [path] for robot, path in paths.items() if path.exists()}, run_dir / "recording.mcap")
     for path in paths.values():
         path.unlink(missing_ok=True)

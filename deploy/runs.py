@@ -220,6 +220,7 @@ def _run_virtual(scenario: Scenario, options: argparse.Namespace, world: Any, ru
             progress=progress.update,
             world=world,
             checker=checker,
+            life_sink=writer.begin_life,
         )
     writer.close()
     return result

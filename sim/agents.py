@@ -51,6 +51,7 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
         "lateness": table(scenario.lateness_of(robot)),
         "coast": table(scenario.coast),
         "network": table(scenario.network),
+        "state": table(scenario.state),
         "sensors": {
             name: {
                 "kind": sensor_kind(name, sensor),

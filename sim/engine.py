@@ -29,7 +29,7 @@ from sim.engine_faults import ClockChange, EngineFaults, Forged, Happening, Paus
 from sim.fault_plan import trial_faults
 from sim.faulty_world import FaultyWorld
 from sim.invariants import InvariantChecker
-from sim.lives import Process
+from sim.lives import LifeSink, Process
 from sim.metrics import TrialTrace
 from sim.reach import Reach
 from sim.sampling import MeasurementLog, Sampler
@@ -87,6 +87,7 @@ class VirtualEngine:
         recorders: dict[str, Recorder] | None = None,
         fate_sink: FateSink | None = None,
         checker: InvariantChecker | None = None,
+        life_sink: LifeSink | None = None,
     ) -> None:
         self._checker = checker
         world = FaultyWorld(world, seed, {robot.id: autopilot_fix(robot) for robot in scenario.robots})
@@ -104,6 +105,7 @@ class VirtualEngine:
                 seed,
                 (recorders or {}).get(robot.id),
                 self._faults.clock(robot.id),
+                life_sink,
             )
             for robot in scenario.robots
         }
@@ -228,10 +230,10 @@ class VirtualEngine:
     def _happen(self, process: Process, what: Happening) -> None:
         """A fault of a process or clock, or a forged packet."""
         match what:
-            case Stop():
-                process.stop()
+            case Stop(in_order):
+                process.stop(in_order)
             case Start(keep_state):
-                process.start(keep_state)
+                process.start(self._now, keep_state)
                 self._applied.pop(process.robot, None)
             case Pause():
                 process.pause()
@@ -271,6 +273,8 @@ class VirtualEngine:
         """What a robot makes of an event."""
         if self._checker is not None:
             self._checker.after(node, self._now, event, out)
+        if out.estimates:
+            self._processes[node.robot].save(out.estimates[-1])
         for packet in out.packets:
             self._transmit(packet)
         self._arm(node.robot)

@@ -28,7 +28,9 @@ from sim.faulty_world import FaultyWorld
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """The process ends."""
+    """The process ends, by a kill or in good order."""
+
+    in_order: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +108,7 @@ class EngineFaults:
                 if end < FOREVER_NS:
                     yield end, fault.robot, Start(fault.state == "kept")
             case RestartPart():
-                yield begin, fault.robot, Stop()
+                yield begin, fault.robot, Stop(in_order=True)
                 yield (begin if end == FOREVER_NS else end), fault.robot, Start(True)
             case PausePart():
                 yield begin, fault.robot, Pause()

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 from agent.clock_faults import FaultyClock
 from agent.config import AgentConfig
 from agent.core import NisSum
+from agent.effects import Estimate
 from agent.node import Node, Recorder, rejected
+from agent.saved_state import StateError, restarted, usable
+from agent.settings import nanoseconds
 
 SOFTWARE = "cofix-0.1.0"
+
+LifeSink = Callable[[str, int, Estimate | None], None]
+"""(robot, own time, the estimate it had saved) of every start after the first."""
 
 MAX_KEPT = 64
 """Packets, and sensor data, that wait for a process that is paused: its sockets keep no more."""
@@ -31,29 +37,49 @@ class Process:
     """One robot's process. `node` is None while it is down."""
 
     def __init__(
-        self, robot: str, config: AgentConfig, seed: int, recorder: Recorder | None, clock: FaultyClock
+        self,
+        robot: str,
+        config: AgentConfig,
+        seed: int,
+        recorder: Recorder | None,
+        clock: FaultyClock,
+        life_sink: LifeSink | None = None,
     ) -> None:
         self.robot, self.clock = robot, clock
-        self._config, self._seed, self._recorder = config, seed, recorder
+        self._config, self._seed, self._recorder, self._life_sink = config, seed, recorder, life_sink
+        self._saved: Estimate | None = None
+        self._interval_ns = nanoseconds(config.state.interval_s)
         self._lives = 0
         self._incarnation = 0
         self._past: list[Node] = []
         self._waiting: Waiting | None = None
         self.node: Node | None = None
-        self.start()
+        self.start(0)
 
     # -- lives ----------------------------------------------------------------------------------------------
 
-    def start(self, keep_state: bool = True) -> None:
-        """Begin a life, as a process does that is started with the same configuration again."""
+    def start(self, t_ns: int, keep_state: bool = True) -> None:
+        """Begin a life at `t_ns`, as a process does that is started with the same configuration again."""
         if self.node is not None:
             return
+        settings, now_ns = self._config.settings(0), self.clock.local_ns(t_ns)
+        if not keep_state:
+            self._saved = None
+        saved = self._saved
+        if saved is not None:
+            try:
+                usable(settings, saved, now_ns, nanoseconds(self._config.state.max_age_s))
+                settings = restarted(settings, saved)
+            except StateError:
+                saved = None
+        if self._lives and self._life_sink is not None:
+            self._life_sink(self.robot, now_ns, saved)
         self._incarnation += 1
         self._lives += 1
         name = f"{self._seed}/{self.robot}" + (f"/{self._lives}" if self._lives > 1 else "")
         boot = hashlib.blake2b(name.encode(), digest_size=7).digest()
         self.node = Node(
-            self._config.settings(0),
+            settings,
             self._config.network.settings(self._config.lateness.horizon_s),
             boot_id=int.from_bytes(boot, "little"),
             incarnation=self._incarnation,
@@ -62,9 +88,16 @@ class Process:
             recorder=self._recorder,
         )
 
-    def stop(self) -> None:
-        """End the life: all that was in memory is gone."""
+    def save(self, estimate: Estimate) -> None:
+        """An estimate was published: it goes to the state file if that is due."""
+        if self._saved is None or estimate.t_ns - self._saved.t_ns >= self._interval_ns:
+            self._saved = estimate
+
+    def stop(self, in_order: bool = False) -> None:
+        """End the life: all that was in memory is gone, unless it ends in good order."""
         if self.node is not None:
+            if in_order:
+                self._saved = self.node.agent.estimate() or self._saved
             self._past.append(self.node)
         self.node = self._waiting = None
 

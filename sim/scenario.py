@@ -36,6 +36,7 @@ from agent.config_parts import (
     RobotModel,
     SensorKind,
     SigmaPart,
+    StatePart,
 )
 from agent.estimation.motion import TargetMotion
 from agent.estimation.observation import mount_of
@@ -242,6 +243,7 @@ class Scenario(Part):
     lateness: LatenessPart = LatenessPart()
     coast: CoastPart = CoastPart()
     network: NetworkPart = NetworkPart()
+    state: StatePart = StatePart()
     links: LinksPart = LinksPart()
     robots: Annotated[list[RobotPart], Field(min_length=1)]
     targets: list[TargetPart] = []

@@ -8,6 +8,7 @@ from agent.config_file import ConfigError
 from agent.node import Recorder
 from sim.engine import FateSink, TrialResult, VirtualEngine
 from sim.invariants import InvariantChecker
+from sim.lives import LifeSink
 from sim.recorded_world import RecordedWorld
 from sim.recordings.recording import RecordingError
 from sim.scenario import Scenario
@@ -34,10 +35,18 @@ def run_trial(
     progress: Callable[[int, int], None] | None = None,
     world: World | None = None,
     checker: InvariantChecker | None = None,
+    life_sink: LifeSink | None = None,
 ) -> TrialResult:
     """Play one trial; equal arguments give equal results. Raises `InvariantBreach` if a `checker` finds one."""
     world = world if world is not None else open_world(scenario, seed)
     engine = VirtualEngine(
-        scenario, world, seed, with_bound=with_bound, recorders=recorders, fate_sink=fate_sink, checker=checker
+        scenario,
+        world,
+        seed,
+        with_bound=with_bound,
+        recorders=recorders,
+        fate_sink=fate_sink,
+        checker=checker,
+        life_sink=life_sink,
     )
     return engine.run(progress)

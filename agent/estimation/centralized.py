@@ -16,6 +16,7 @@ from agent.estimation.motion import RobotMotion, TargetMotion
 from agent.estimation.observation import AbsoluteModel, RelativeModel, absolute_model
 from agent.estimation.track_start import start_track, start_vaguely
 from agent.estimation.unscented import Propagated, Transform, observe
+from agent.estimation.wide_heading import by_angles
 from agent.events import LEVEL
 from network.messages import NO_MOUNT, Mount
 
@@ -154,11 +155,13 @@ class CentralizedFilter:
         self.cov[part, part] = moved.cov
 
     def _update(self, rows: NDArray[np.intp], model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> float:
+        cov = self.cov[np.ix_(rows, rows)]
+        model, z, R = by_angles(model, z, R, cov)
         predicted = observe(
             model.h,
             model.jacobian,
             self.mean[rows],
-            self.cov[np.ix_(rows, rows)],
+            cov,
             model.angles,
             self._transform,
             turning=model.turning,

@@ -24,6 +24,7 @@ from agent.estimation.intersection import Weight, best_inflated_update
 from agent.estimation.motion import STATES, StateLayout
 from agent.estimation.observation import AbsoluteModel, RelativeModel, relative_model
 from agent.estimation.unscented import Predicted, Transform, UnscentedParameters, observe
+from agent.estimation.wide_heading import by_angles
 from network.messages import NEVER, Measurement, Snapshot
 
 Array = NDArray[np.float64]
@@ -72,6 +73,7 @@ def absolute_update(
     (mean, cov) is the belief at the instant of the measurement. None when the posterior would not be positive
     definite.
     """
+    model, z, R = by_angles(model, z, R, cov)
     predicted = observe(
         model.h, model.jacobian, mean, cov, model.angles, options.transform, options.parameters, model.turning
     )
@@ -118,6 +120,9 @@ def sighting_update(
     takes the two beliefs for independent. Returns (own update, target update, NIS per dof).
     """
     (own_mean, own_cov, own_layout), (target_mean, target_cov, target_layout) = own, target
+    by_own, z, R = by_angles(model, z, R, own_cov)
+    assert isinstance(by_own, RelativeModel)
+    model = by_own
     n, m = len(own_mean), len(target_mean)
     joint = np.zeros((n + m, n + m))
     joint[:n, :n], joint[n:, n:] = own_cov, target_cov
@@ -200,6 +205,37 @@ class StackedModel:
         return np.concatenate([model.jacobian(state) for model in self._models], axis=-2)
 
 
+def stacked(
+    measurements: Sequence[Measurement], observer: StateLayout, subject: StateLayout, cov: Array
+) -> tuple[RelativeModel | StackedModel, Array, Array]:
+    """Measurements of one subject by an observer of covariance `cov` as one: model, z (m,), R (m, m).
+
+    Raises `OutOfViewError`.
+    """
+    models, parts, noises = [], [], []
+    for item in measurements:
+        model, z, R = by_angles(relative_model(item, observer, subject), item.z, item.R, cov)
+        assert isinstance(model, RelativeModel)
+        models.append(model)
+        parts.append(z)
+        noises.append(R)
+    if len(models) == 1:
+        return models[0], parts[0], noises[0]
+    return StackedModel(models, [len(z) for z in parts]), np.concatenate(parts), block_diagonal(noises)
+
+
+def block_diagonal(blocks: Sequence[Array]) -> Array:
+    """Square blocks on the diagonal of a matrix."""
+    if len(blocks) == 1:
+        return blocks[0]
+    size = sum(len(block) for block in blocks)
+    found, row = np.zeros((size, size)), 0
+    for block in blocks:
+        found[row : row + len(block), row : row + len(block)] = block
+        row += len(block)
+    return found
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
     """What both robots of a pair compute alike from the two snapshots of a contact.
@@ -253,14 +289,7 @@ def contact(
             cross = clip_canonical_correlations(P_i, cross, P_j)
             joint[:n, n:], joint[n:, :n] = cross, cross.T
     observer, subject = STATES[initiator.belief.model], STATES[responder.belief.model]
-    models = [relative_model(item, observer, subject) for item in measurements]
-    model = models[0] if len(models) == 1 else StackedModel(models, [len(item.z) for item in measurements])
-    z = np.concatenate([item.z for item in measurements])
-    R = np.zeros((len(z), len(z)))
-    row = 0
-    for item in measurements:
-        R[row : row + len(item.z), row : row + len(item.z)] = item.R
-        row += len(item.z)
+    model, z, R = stacked(measurements, observer, subject, initiator.belief.cov)
     mean = np.concatenate([initiator.belief.mean, responder.belief.mean])
     predicted = observe(
         model.h, model.jacobian, mean, joint, model.angles, options.transform, options.parameters, model.turning

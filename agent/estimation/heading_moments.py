@@ -11,11 +11,18 @@ heading phi that leans on a gain of turning. For jointly Gaussian g and phi the 
 and the covariance with the state is P times the expected gradient (Stein's lemma), which makes F the statistical
 linearization. This is what an unscented prediction (UT-CLAT eq. 9-12) approximates. Sigma points of a heading that is
 wider than about a radian lie turns apart and alias: covariances of the position shrink that should grow.
+
+What is not linear in the state, the spread of the step about its linear part, is no white noise: a heading that is off
+stays off, and the next step leaves the same over. A Gaussian keeps no correlation for that. With a wide heading, where
+it matters, the correlation of a step's spread L with the position error of covariance P is taken for unknown:
+(1 + 1/r) L + (1 + r) P bounds their sum whatever it is, and r^2 = tr L / tr P adds the deviations up. Otherwise a robot
+that heads anywhere would seem to stay where it is.
 """
 
 from __future__ import annotations
 
 import cmath
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,15 +32,25 @@ from agent.estimation.unscented import Propagated
 
 Array = NDArray[np.float64]
 
+PERSISTENT_RAD2 = 0.1
+"""Variance of a heading from which on what a step leaves over counts as correlated with what earlier ones left over."""
+
+
 
 def moved_in_its_frame(
-    mean: Array, cov: Array, delta: Array, noise: Array, heading: int, gains: tuple[int, int] | None = None
+    mean: Array,
+    cov: Array,
+    delta: Array,
+    noise: Array,
+    heading: int,
+    gains: tuple[int, int] | None = None,
+    persistent: bool = True,
 ) -> Propagated:
     """Belief (n,), (n, n) of a state x, y, ... after a body increment, with noise in the body frame at its beginning.
 
     delta (k,) and noise (k, k) are of the increment's dx, dy, [dz,] dyaw, dz being of the third component. `heading`
     says where the heading sits, `gains` the gains of forward motion and of turning: the chord then leans by half of
-    what the turn is longer. The mean's heading is wrapped.
+    what the turn is longer. The mean's heading is wrapped. `persistent` False: the moments of this step alone.
     """
     n, steps = len(mean), delta.tolist()
     dyaw, u = steps[-1], complex(steps[0], steps[1])
@@ -72,6 +89,11 @@ def moved_in_its_frame(
     # What the step's own spread has beyond its part that is linear in the state: E|z|^2 and E z^2 of a complex number.
     spread = abs(u) ** 2 * (scale**2 + V) - abs(step) ** 2 - linear
     pseudo = u**2 * ((scale + 2j * C) ** 2 + V) * cmath.exp(2j * phi - 2.0 * s2) - step**2 - pseudo_linear
+    place = float(new[0, 0] + new[1, 1])
+    if persistent and s2 > PERSISTENT_RAD2 and place > 0.0 and spread > 0.0:
+        ratio = math.sqrt(spread / place)
+        new[:2, :2] *= 1.0 + ratio
+        spread, pseudo = spread * (1.0 + 1.0 / ratio), pseudo * (1.0 + 1.0 / ratio)
 
     Q = noise.tolist()
     spread += Q[0][0] + Q[1][1]

@@ -239,7 +239,7 @@ def test_a_robot_that_is_not_in_it_is_named(recorded: Path) -> None:
 def test_recordings_of_robots_become_one(tmp_path: Path) -> None:
     paths = {robot: tmp_path / f"{robot}.mcap" for robot in ("r1", "r2")}
     meet(paths)
-    merge(paths, tmp_path / "both.mcap")
+    merge({robot: [path] for robot, path in paths.items()}, tmp_path / "both.mcap")
     assert read_agents(tmp_path / "both.mcap") == {"r1": (config("r1"), 7), "r2": (config("r2"), 7)}
     for robot, path in paths.items():
         assert replay(tmp_path / "both.mcap", robot) == replay(path, robot)
@@ -253,7 +253,7 @@ def test_what_a_killed_robot_left_is_merged_too(tmp_path: Path) -> None:
     data = paths["r2"].read_bytes()
     paths["r2"].write_bytes(data[: len(data) * 2 // 3])
     paths["r3"].write_bytes(b"")
-    merge(paths, tmp_path / "all.mcap")
+    merge({robot: [path] for robot, path in paths.items()}, tmp_path / "all.mcap")
     assert read_agents(tmp_path / "all.mcap").keys() == {"r1", "r2"}
     events, _, broken = replay(tmp_path / "all.mcap", "r2")
     assert 0 < events < whole

@@ -22,6 +22,7 @@ class Linear:
     """h(x) = H x, as an observation model."""
 
     angles = ()
+    turning = ()
 
     def __init__(self, H: Array) -> None:
         self.H = H

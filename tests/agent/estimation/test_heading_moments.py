@@ -58,7 +58,7 @@ def test_the_moments_are_those_of_samples(case: str, sigma: float) -> None:
     delta = rng.normal(size=k)
     spread = rng.normal(size=(k, k)) * 0.3
     noise = spread @ spread.T
-    found = moved_in_its_frame(mean, cov, delta, noise, heading, gains)
+    found = moved_in_its_frame(mean, cov, delta, noise, heading, gains, persistent=False)
     before, after = cloud(mean, cov, delta, noise, heading, gains)
     assert np.linalg.norm(found.mean - after.mean(axis=0)) < 0.02 * max(1.0, sigma)
     sampled = np.cov(after.T)
@@ -96,3 +96,20 @@ def test_a_position_is_not_learnt_by_driving_blindly(gains: tuple[int, int] | No
             assert smallest > before
             before = smallest
     assert before > 1.0
+
+
+@pytest.mark.parametrize("sigma_rad", [0.5, 1.0, 3.0, 10.0])
+def test_who_heads_anywhere_and_goes_on_ends_up_anywhere(sigma_rad: float) -> None:
+    """A straight drive of many steps with a heading that stays unknown: the error is not more than is claimed."""
+    rng = np.random.default_rng(3)
+    cov = np.diag([0.04, 0.04, sigma_rad**2])
+    starts = np.sqrt(np.diagonal(cov)) * rng.standard_normal((4000, 3))
+    mean = np.zeros(3)
+    for _ in range(60):
+        moved = moved_in_its_frame(mean, cov, np.array([0.1, 0.0, 0.0]), np.zeros((3, 3)), 2)
+        mean, cov = moved.mean, moved.cov
+    truth = starts[:, :2] + 6.0 * np.stack([np.cos(starts[:, 2]), np.sin(starts[:, 2])], axis=1)
+    error = truth - mean[:2]
+    claimed = float(np.trace(cov[:2, :2]))
+    assert float((error**2).sum(axis=1).mean()) < 1.02 * claimed
+    assert claimed < 4.0 * float((error**2).sum(axis=1).mean())
