@@ -99,6 +99,7 @@ class LatenessPart(Part):
     horizon_s: Positive = 5.0
     odometry_wait_s: NotNegative = 1.0
     clock_sigma_s: NotNegative = 0.0
+    max_clock_sigma_s: Positive = 0.1
 
     def settings(self) -> LatenessSettings:
         return LatenessSettings(
@@ -131,11 +132,13 @@ class NetworkPart(Part):
     hello_period_s: Positive = 0.5
     silent_after_s: Positive = 3.0
 
-    def settings(self, horizon_s: float) -> EndpointSettings:
+    def settings(self, lateness: LatenessPart) -> EndpointSettings:
         return EndpointSettings(
             hello_period_ns=nanoseconds(self.hello_period_s),
             silent_after_ns=nanoseconds(self.silent_after_s),
-            horizon_ns=nanoseconds(horizon_s),
+            horizon_ns=nanoseconds(lateness.horizon_s),
+            clock_sigma_ns=nanoseconds(lateness.clock_sigma_s),
+            max_clock_sigma_ns=nanoseconds(lateness.max_clock_sigma_s),
         )
 
 

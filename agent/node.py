@@ -11,7 +11,7 @@ from agent.effects import Alarm, Broadcast, Effect, Estimate, Publish, Send
 from agent.events import Event, LinkChange, Received, Tick
 from agent.sensor_input import SensorConfig, SensorError, decode
 from agent.settings import AgentSettings
-from network.endpoint import Delivery, Endpoint, EndpointSettings, PeerChange
+from network.endpoint import ClockChange, Delivery, Endpoint, EndpointSettings, PeerChange
 from network.messages import Packet
 from network.wire import OversizeError
 
@@ -71,7 +71,9 @@ class Node:
         """A packet from the network."""
         out = Outgoing()
         for item in self.endpoint.receive(now_ns, packet):
-            if isinstance(item, Delivery):
+            if isinstance(item, ClockChange):
+                out.alarms.append(_clock_alarm(item))
+            elif isinstance(item, Delivery):
                 self._handle(Received(now_ns, item.message, item.offset_ns, item.offset_sigma_ns), out)
             else:
                 self._handle(_link_change(now_ns, item), out)
@@ -114,6 +116,19 @@ class Node:
             self.counters["send.oversize"] += 1
         except ValueError:
             self.counters["send.degenerate"] += 1
+
+
+CLOCK_REASONS = {
+    "steps": "it is set again and again",
+    "offset": "it is off by far more than lateness.clock_sigma_s allows; set the clock, or enlarge that",
+    "uncertain": "its offset is known less well than lateness.max_clock_sigma_s",
+}
+
+
+def _clock_alarm(change: ClockChange) -> Alarm:
+    if change.reason is None:
+        return Alarm("clock_usable", change.peer)
+    return Alarm("clock_unusable", f"{change.peer}: {CLOCK_REASONS[change.reason]}")
 
 
 def _link_change(now_ns: int, change: PeerChange) -> LinkChange:

@@ -205,7 +205,7 @@ class AgentShell:
             self._recording.begin_life(self.robot, self._clock.now_ns(), self._found.estimate)
         self._node = Node(
             settings,
-            config.network.settings(config.lateness.horizon_s),
+            config.network.settings(config.lateness),
             boot_id=self._boot_id,
             incarnation=self._found.incarnation,
             software=SOFTWARE,
@@ -331,6 +331,11 @@ class AgentShell:
         agent = self._node.agent
         status: dict[str, Any] = {"robot": self.robot, **agent.status()}
         status["peers"] = {peer.peer: peer.up for peer in self._node.endpoint.peers()}
+        status["clocks"] = {
+            peer.peer: {"offset_s": peer.offset_ns * 1e-9, "steps": peer.clock_steps, "unusable": peer.clock_unusable}
+            for peer in self._node.endpoint.peers()
+            if peer.offset_ns is not None
+        }
         status["rejected"] = rejected(self._node)
         status["state_file"] = dict(self.counters)
         status["lag_max_s"] = self._lags.max_ns * 1e-9

@@ -138,7 +138,7 @@ async def _measured(rounds: int) -> Exchange:
         config = agent_config(made, world, part)
         node = Node(
             config.settings(0),
-            config.network.settings(config.lateness.horizon_s),
+            config.network.settings(config.lateness),
             boot_id=number + 1,
             incarnation=1,
             software="benchmark",

@@ -14,6 +14,13 @@ KEPT_EXCHANGES = 16
 DRIFT_PPM = 50
 """How fast two crystal clocks may part; an exchange's error grows by this with its age."""
 
+MANY_STEPS = 3
+STEPS_WITHIN_NS = 60 * 10**9
+"""A clock that is set so often is of no use to anybody."""
+
+SLACK_NS, FAR = 50_000_000, 5.0
+"""Offsets up to that many deviations, and this on top, contradict nobody."""
+
 MAX_SPAN_NS = 60 * 10**9
 """An exchange that took longer says nothing."""
 
@@ -36,6 +43,7 @@ class PeerClock:
         self._exchanges: deque[_Exchange] = deque(maxlen=KEPT_EXCHANGES)
         self._best: _Exchange | None = None
         self._latest_ns = 0
+        self._step_ns: deque[int] = deque(maxlen=MANY_STEPS)
         self.steps = 0
         """How often an exchange contradicted all before it, which only a clock that was set can do."""
 
@@ -56,6 +64,7 @@ class PeerClock:
             if apart_ns > exchange.error_ns(t4_ns) + best.error_ns(t4_ns) + 1:
                 self._exchanges.clear()
                 self.steps += 1
+                self._step_ns.append(t4_ns)
         self._exchanges.append(exchange)
         # Errors grow alike with time, so that which one is the least does not change with it.
         self._best = min(self._exchanges, key=lambda known: known.error_ns(t4_ns))
@@ -71,6 +80,25 @@ class PeerClock:
         if best is None:
             return None
         return best.offset_ns, math.ceil(best.error_ns(now_ns) / math.sqrt(3))
+
+    def unusable(self, now_ns: int, prior_ns: int, most_ns: int) -> str | None:
+        """Why nothing of the peer's stamps can be made use of at `now_ns`, or None.
+
+        steps      the clock was set `MANY_STEPS` times within `STEPS_WITHIN_NS`
+        offset     it is off by far more than `prior_ns`, how well the fleet's clocks agree (1 sigma), allows
+        uncertain  what is measured of it and the prior leave a deviation above `most_ns`
+        """
+        known = self.at(now_ns)
+        if known is None:
+            return None
+        offset_ns, sigma_ns = known
+        if len(self._step_ns) == MANY_STEPS and now_ns - self._step_ns[0] < STEPS_WITHIN_NS:
+            return "steps"
+        if abs(offset_ns) > SLACK_NS + FAR * math.hypot(prior_ns, sigma_ns):
+            return "offset"
+        if prior_ns and prior_ns * sigma_ns > most_ns * math.hypot(prior_ns, sigma_ns):
+            return "uncertain"
+        return None
 
     @property
     def offset_ns(self) -> int | None:

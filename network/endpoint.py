@@ -13,6 +13,7 @@ each refusal is counted as `rejected.<reason>`. Reasons besides those of `networ
     duplicate          accepted already
     too_old_seq        so far behind that it cannot be told from a duplicate
     too_many_peers     the peer table is full
+    clock_unusable     the sender's clock is beyond repair: its stamps mean nothing
 
 `received = delivered + hellos + sum of rejected.*` holds at all times.
 """
@@ -53,6 +54,8 @@ class EndpointSettings:
     horizon_ns       age limit of a message's stamps
     offset_bound_ns  how far in the future they may lie
     max_bytes        limit of one message [bytes]
+    clock_sigma_ns   how well the clocks of the fleet agree by themselves (1 sigma), 0: one clock for all
+    max_clock_sigma_ns   a peer's clock that is known less well than that is of no use
     """
 
     hello_period_ns: int = 500_000_000
@@ -60,6 +63,8 @@ class EndpointSettings:
     horizon_ns: int = 5_000_000_000
     offset_bound_ns: int = 1_000_000_000
     max_bytes: int = MAX_MESSAGE_BYTES
+    clock_sigma_ns: int = 0
+    max_clock_sigma_ns: int = 100_000_000
 
     def __post_init__(self) -> None:
         for name in ("hello_period_ns", "silent_after_ns", "horizon_ns", "offset_bound_ns"):
@@ -89,8 +94,19 @@ class PeerChange:
 
 
 @dataclass(frozen=True, slots=True)
+class ClockChange:
+    """A peer's clock has become unusable for a `reason` of `PeerClock.unusable`, or usable again (None)."""
+
+    peer: str
+    reason: str | None
+
+
+@dataclass(frozen=True, slots=True)
 class PeerStatus:
-    """What is known of one peer, for people: `counts` has accepted, rejected, lives, clock_refused."""
+    """What is known of one peer, for people: `counts` has accepted, rejected, lives, clock_refused.
+
+    `clock_unusable`: why its clock is of no use; None: it is.
+    """
 
     peer: str
     up: bool
@@ -100,6 +116,7 @@ class PeerStatus:
     offset_ns: int | None
     offset_sigma_ns: int | None
     clock_steps: int
+    clock_unusable: str | None
     counts: dict[str, int]
 
 
@@ -129,6 +146,7 @@ class Endpoint:
         self._next_seq: dict[tuple[str, str | None], int] = {}
         self._hello_due_ns: int | None = None
         self._echo_turn = 0
+        self._clock_changes: list[ClockChange] = []
         encode(self._header(0, 0, 0), Hello(software))
 
     # --- out ----------------------------------------------------------------------------------------------
@@ -190,22 +208,24 @@ class Endpoint:
 
     # --- in -----------------------------------------------------------------------------------------------
 
-    def receive(self, now_ns: int, packet: Packet) -> list[Delivery | PeerChange]:
+    def receive(self, now_ns: int, packet: Packet) -> list[Delivery | PeerChange | ClockChange]:
         """What a packet means to the layer above: nothing, a change of its sender, a message, or both."""
         self.counters["received"] += 1
         self.counters["received_bytes"] += len(packet.payload)
+        self._clock_changes = []
         try:
-            return self._receive(now_ns, packet)
+            return [*self._receive(now_ns, packet), *self._clock_changes]
         except WireError as error:
             self.counters[f"rejected.{error.reason}"] += 1
             peer = self._table.get(packet.source)
             if peer is not None:
                 peer.counters["rejected"] += 1
-            return []
+            return list(self._clock_changes)
 
     def _receive(self, now_ns: int, packet: Packet) -> list[Delivery | PeerChange]:
         message = self._admissible(packet)
         header, body = message.header, message.body
+        fresh: Hello | None = None
         peer = self._table.get(header.source)
         if peer is not None:
             refusal = peer.refusal(
@@ -213,7 +233,15 @@ class Endpoint:
             )
             if refusal is not None:
                 raise WireError(refusal)
-        self._check_age(now_ns, header, peer)
+        if isinstance(body, Hello) and peer is not None and not peer.is_new_life(header.boot_id, header.incarnation):
+            # An echo tells the clock whose stamps are about to be judged: one that was set must not lock its robot out.
+            self._take_echo(now_ns, header, body, peer)
+        elif isinstance(body, Hello):
+            fresh = body
+        if not isinstance(body, Hello) or self._knows_clock(now_ns, header, peer):
+            self._check_age(now_ns, header, peer)
+        if peer is not None and peer.clock_unusable is not None and not isinstance(body, Hello):
+            raise WireError("clock_unusable")
         if peer is None:
             peer = self._table.admit(now_ns, header.source, header.boot_id, header.incarnation)
             if peer is None:
@@ -223,7 +251,8 @@ class Endpoint:
             events.append(_change(peer))
         if isinstance(body, Hello):
             self.counters["hellos"] += 1
-            self._take_echo(now_ns, header, body, peer)
+            if fresh is not None:
+                self._take_echo(now_ns, header, fresh, peer)
         else:
             self.counters["delivered"] += 1
             known = peer.clock.at(now_ns)
@@ -258,11 +287,23 @@ class Endpoint:
             if age_ns > self.settings.horizon_ns:
                 raise WireError("too_old")
 
+    def _knows_clock(self, now_ns: int, header: Header, peer: Peer | None) -> bool:
+        """Whether the clock of a message's sender is known: without that nobody can say how old a hello is."""
+        if peer is None or peer.is_new_life(header.boot_id, header.incarnation):
+            return False
+        return peer.clock.at(now_ns) is not None
+
     def _take_echo(self, now_ns: int, header: Header, hello: Hello, peer: Peer) -> None:
         for echo in hello.echoes:
             if echo.peer == self.robot and not peer.clock.add(echo.t1_ns, echo.t2_ns, header.t_send_ns, now_ns):
                 self.counters["clock_refused"] += 1
                 peer.counters["clock_refused"] += 1
+        settings = self.settings
+        reason = peer.clock.unusable(now_ns, settings.clock_sigma_ns, settings.max_clock_sigma_ns)
+        if reason != peer.clock_unusable:
+            peer.clock_unusable = reason
+            self.counters["clock_unusable" if reason is not None else "clock_usable"] += 1
+            self._clock_changes.append(ClockChange(peer.robot, reason))
 
     # --- for people ---------------------------------------------------------------------------------------
 
@@ -278,6 +319,7 @@ class Endpoint:
                 peer.clock.offset_ns,
                 peer.clock.sigma_ns,
                 peer.clock.steps,
+                peer.clock_unusable,
                 dict(peer.counters),
             )
             for peer in self._table.sorted()

@@ -60,6 +60,7 @@ class Peer:
         self.sent_ns = 0
         self._latest_sent_ns = -1
         self.clock = PeerClock()
+        self.clock_unusable: str | None = None
         self.counters: Counter[str] = Counter()
         self._superseded: deque[int] = deque(maxlen=MAX_BOOT_IDS)
         self._windows: dict[str, DuplicateWindow] = {}
@@ -94,7 +95,7 @@ class Peer:
             self.boot_id, self.incarnation = boot_id, incarnation
             self._windows.clear()
             self._latest_sent_ns = -1
-            self.clock = PeerClock()
+            self.clock, self.clock_unusable = PeerClock(), None
             self.counters["lives"] += 1
             changed = True
         self._windows.setdefault(channel, DuplicateWindow()).record(seq)

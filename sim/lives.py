@@ -80,7 +80,7 @@ class Process:
         boot = hashlib.blake2b(name.encode(), digest_size=7).digest()
         self.node = Node(
             settings,
-            self._config.network.settings(self._config.lateness.horizon_s),
+            self._config.network.settings(self._config.lateness),
             boot_id=int.from_bytes(boot, "little"),
             incarnation=self._incarnation,
             software=SOFTWARE,

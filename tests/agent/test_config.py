@@ -120,7 +120,7 @@ def test_a_team_is_told_of_each_others_starts(tmp_path: Path) -> None:
 
 def test_the_horizon_of_the_history_is_the_age_limit_of_messages() -> None:
     config = validate(AgentConfig, example(), "r1")
-    assert config.network.settings(horizon_s=4.0).horizon_ns == 4_000_000_000
+    assert config.network.settings(config.lateness).horizon_ns == round(config.lateness.horizon_s * 1e9)
 
 
 def test_odometry_noise_is_handed_over_completely() -> None:

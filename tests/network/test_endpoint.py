@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from network.endpoint import Delivery, Endpoint, EndpointSettings, PeerChange
+from network.endpoint import ClockChange, Delivery, Endpoint, EndpointSettings, PeerChange
 from network.messages import (
     MAX_ECHOES,
     MAX_MESSAGE_BYTES,
@@ -256,7 +256,7 @@ def hello_round(a: Endpoint, b: Endpoint, t_ns: int, ahead_ns: int, delay_ns: in
 
 @pytest.mark.parametrize("ahead_ns", [300 * MS, -900 * MS])
 def test_hellos_measure_the_offset_of_the_clocks(ahead_ns: int) -> None:
-    a, b = endpoint("r1"), endpoint("r2")
+    a, b = endpoint("r1", clock_sigma_ns=S), endpoint("r2", clock_sigma_ns=S)
     hello_round(a, b, T0, ahead_ns, 2 * MS)
     hello_round(a, b, T0 + S, ahead_ns, 2 * MS)
     assert a.peers()[0].offset_ns == ahead_ns
@@ -270,7 +270,7 @@ def test_hellos_measure_the_offset_of_the_clocks(ahead_ns: int) -> None:
 
 
 def test_ages_are_judged_on_the_senders_clock_once_it_is_known() -> None:
-    a, b = endpoint("r1"), endpoint("r2")
+    a, b = endpoint("r1", clock_sigma_ns=S), endpoint("r2", clock_sigma_ns=S)
     behind_ns = 900 * MS
     for k in range(3):
         hello_round(a, b, T0 + k * S, -behind_ns, 2 * MS)
@@ -282,10 +282,52 @@ def test_ages_are_judged_on_the_senders_clock_once_it_is_known() -> None:
     assert endpoint("r1").receive(now_ns, packet) == []
 
 
-def test_clocks_further_apart_than_the_bound_never_meet_and_the_counter_says_so() -> None:
+@pytest.mark.parametrize("ahead_ns", [-2 * S, 2 * S, 100 * S, -100 * S])
+def test_clocks_however_far_apart_meet_if_the_fleet_allows_for_it(ahead_ns: int) -> None:
+    a, b = endpoint("r1", clock_sigma_ns=50 * S), endpoint("r2", clock_sigma_ns=50 * S)
+    for k in range(3):
+        hello_round(a, b, T0 + k * S, ahead_ns, 2 * MS)
+    assert a.peers()[0].offset_ns == ahead_ns and a.peers()[0].clock_unusable is None
+    sent_ns = T0 + 3 * S
+    packet = b.send(sent_ns + ahead_ns, "r1", sent_ns + ahead_ns, reply())
+    assert len(deliveries(a.receive(sent_ns, packet))) == 1
+
+
+def test_a_clock_that_is_off_by_more_than_is_allowed_is_named_and_not_used() -> None:
     a, b = endpoint("r1"), endpoint("r2")
-    hello_round(a, b, T0, -2 * S, 2 * MS)
-    assert rejected(b) == {"rejected.from_future": 1}
+    for packet in a.tick(T0)[0]:
+        b.receive(T0 + 2 * S, packet)
+    told = [event for packet in b.tick(T0 + 2 * S)[0] for event in a.receive(T0 + MS, packet)]
+    assert ClockChange("r2", "offset") in told
+    assert a.peers()[0].clock_unusable == "offset"
+    packet = b.send(T0 + 3 * S, "r1", T0 + 3 * S, reply())
+    assert deliveries(a.receive(T0 + S, packet)) == []
+    assert rejected(a) == {"rejected.clock_unusable": 1}
+
+
+def test_a_clock_that_is_set_right_again_is_used_again() -> None:
+    a, b = endpoint("r1"), endpoint("r2")
+    for k in range(3):
+        hello_round(a, b, T0 + k * S, 2 * S, 2 * MS)
+    assert a.peers()[0].clock_unusable == "offset"
+    for k in range(3, 12):
+        hello_round(a, b, T0 + k * S, 0, 2 * MS)
+    assert a.peers()[0].clock_unusable is None and a.peers()[0].offset_ns == 0
+    assert len(deliveries(a.receive(T0 + 12 * S, b.send(T0 + 12 * S, "r1", T0 + 12 * S, reply())))) == 1
+
+
+def test_a_clock_that_is_set_again_and_again_is_named() -> None:
+    a, b = endpoint("r1", clock_sigma_ns=50 * S), endpoint("r2", clock_sigma_ns=50 * S)
+    for k in range(24):
+        hello_round(a, b, T0 + k * S, (k // 4) * 3 * S, 2 * MS)
+    assert a.peers()[0].clock_unusable == "steps"
+
+
+def test_long_delays_alone_accuse_nobody() -> None:
+    a, b = endpoint("r1"), endpoint("r2")
+    for k in range(6):
+        hello_round(a, b, T0 + 4 * k * S, 0, S)
+    assert a.peers()[0].clock_unusable is None
 
 
 def test_an_absurd_echo_is_counted_and_ignored() -> None:
