@@ -50,6 +50,13 @@ class FaultyClock:
             t_ns = max(after_ns, local_ns - (self.local_ns(t_ns) - t_ns))
         return t_ns
 
+    def origin_ns(self, local_ns: int) -> int:
+        """The true instant at which the clock said `local_ns`; the later one if it did so twice."""
+        t_ns = local_ns
+        for _ in range(4 if self._faults else 0):
+            t_ns = local_ns - (self.local_ns(t_ns) - t_ns)
+        return t_ns
+
     def changes(self) -> list[int]:
         """True instants at which the clock steps or its rate changes, in order."""
         found = {end for fault in self._faults for end in (fault.begin_ns, fault.end_ns) if end < FOREVER_NS}

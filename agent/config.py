@@ -40,6 +40,7 @@ from agent.config_parts import (
 )
 from agent.estimation.motion import LAYOUTS
 from agent.estimation.observation import mount_of
+from agent.fault_parts import FaultPart
 from agent.joint_room import check_room
 from agent.mavlink import MavlinkEndpointError, parse_endpoint
 from agent.sensor_input import SensorConfig
@@ -137,10 +138,11 @@ class MavlinkPart(Part):
 
 
 class InjectionPart(Part):
-    """Link faults injected at this receiver, for runs on one computer."""
+    """Faults injected at this receiver, for runs on one computer; their times count from the start of the run."""
 
     seed: int
     links: LinksPart = LinksPart()
+    faults: list[FaultPart] = []
     table: str | None = None
     fate_log: str | None = None
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import csv
 import logging
 import os
 import secrets
@@ -16,6 +15,7 @@ import signal
 import socket
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from agent.control import ControlLine
 from agent.effects import Alarm, Estimate
 from agent.events import Event
 from agent.fleet_clock import FleetClock
+from agent.injection import Injection
 from agent.lateness_figures import LatenessFigures
 from agent.mavlink import MavlinkError, MavlinkLink
 from agent.node import Node, Outgoing, rejected
@@ -36,9 +37,6 @@ from agent.saved_state import StateError, restarted, usable
 from agent.settings import AgentSettings, nanoseconds
 from agent.state_file import Found, StateFile
 from agent.state_keeper import StateKeeper
-from network.injected_transport import LinkInjector
-from network.link_feed import LinkFeed
-from network.links import FateRecord, LinkModel, RangeTable
 from network.messages import Channel, Packet
 from network.zenoh_transport import ZenohSettings, ZenohTransport
 
@@ -71,7 +69,7 @@ class AgentShell:
         self._transport: ZenohTransport | None = None
         self._mavlink: MavlinkLink | None = None
         self._reader: AutopilotReader | None = None
-        self._feed: LinkFeed | None = None
+        self._injection: Injection | None = None
         self._recording: RecordingWriter | None = None
         self._control: ControlLine | None = None
         self._sensor_transport: asyncio.BaseTransport | None = None
@@ -86,8 +84,6 @@ class AgentShell:
         self._state = StateFile(self._state_dir, self.robot, config.state.sync)
         self._found = Found(1)
         self._keeper: StateKeeper | None = None
-        self._fates: Any = None
-        self._fate_file: Any = None
 
     async def run(self) -> None:
         """Start, work, stop. Raises ConfigError, TransportError, MavlinkError or OSError when it cannot start."""
@@ -133,33 +129,19 @@ class AgentShell:
         )
         self._receive = self._on_packet
         if config.injection is not None:
-            await self._inject(config.injection)
+            loop = asyncio.get_running_loop()
+            self._injection = Injection(
+                self.robot,
+                config.injection,
+                lambda: self._clock.true_ns(),
+                lambda wait_ns, call: loop.call_later(self._clock.wall_s(wait_ns), call),
+                self._on_packet,
+            )
+            await self._injection.open()
+            self._receive = self._injection.on_packet
         self._transport = ZenohTransport(settings, lambda packet: self._receive(packet))
         await self._transport.start()
         await self._open_sensor_socket()
-
-    async def _inject(self, injection: Any) -> None:
-        table = RangeTable()
-        if injection.fate_log is not None:
-            self._fate_file = Path(injection.fate_log).open("w", newline="")  # noqa: SIM115
-            self._fates = csv.writer(self._fate_file)
-        links = LinkModel(injection.links.settings(injection.seed), table.state, self._log_fate)
-        if injection.table is not None:
-            self._feed = LinkFeed()
-            await self._feed.follow(injection.table, table.publish)
-        loop = asyncio.get_running_loop()
-        injector = LinkInjector(
-            self.robot,
-            links,
-            lambda: self._clock.now_ns(),
-            lambda wait_ns, call: loop.call_later(self._clock.wall_s(wait_ns), call),
-            self._on_packet,
-        )
-        self._receive = injector.on_packet
-
-    def _log_fate(self, record: FateRecord) -> None:
-        if self._fates is not None:
-            self._fates.writerow(fate_row(record))
 
     async def _open_sensor_socket(self) -> None:
         path = self._state_dir / "sensors.sock"
@@ -191,7 +173,24 @@ class AgentShell:
             return False
         begin = self._control.started.result()
         self._clock = FleetClock(begin["t0_ns"], begin["monotonic0_ns"], clock.speed)
+        if self._injection is not None:
+            self._injection.begin(begin["t0_ns"])
+            own = self._injection.clock(self.robot)
+            self._clock = replace(self._clock, faulty=own)
+            for t_ns in own.changes():
+                self._rearm_at(t_ns)
         return True
+
+    def _rearm_at(self, t_ns: int) -> None:
+        """The own clock changes at the true instant `t_ns`: what was due by it is due at another time."""
+        wait_s = self._clock.wall_s(t_ns - self._clock.true_ns())
+        if wait_s > 0.0:
+            asyncio.get_running_loop().call_later(wait_s, self._arm_anew)
+
+    def _arm_anew(self) -> None:
+        if self._node is not None:
+            self._timer_due_ns = -1
+            self._arm()
 
     async def _begin(self) -> None:
         config = self.config
@@ -341,6 +340,8 @@ class AgentShell:
         status["lag_max_s"] = self._lags.max_ns * 1e-9
         injection = self.config.injection
         status["injected"] = injection.links.model_dump(exclude_defaults=True) if injection is not None else {}
+        if self._injection is not None and (faults := self._injection.told()):
+            status["injected"]["faults"] = faults
         if self._reader is not None:
             status["autopilot"] = self._reader.status()
         return status
@@ -375,15 +376,13 @@ class AgentShell:
         (self._state_dir / "sensors.sock").unlink(missing_ok=True)
         if self._recording is not None:
             self._recording.close()
-        if self._fate_file is not None:
-            self._fate_file.close()
         if self._keeper is not None:
             await self._keeper.close()
         if self._control is not None:
             if figures is not None:
                 self._control.say({"done": figures})
             await self._control.close()
-        for opened in (self._feed, self._transport):
+        for opened in (self._injection, self._transport):
             if opened is not None:
                 with contextlib.suppress(TimeoutError):
                     await opened.close()
@@ -391,27 +390,6 @@ class AgentShell:
 
 def _ignore(packet: Packet) -> None:
     """Takes the packets that still arrive while the shell closes."""
-
-
-FATE_COLUMNS = (
-    "source",
-    "destination",
-    "channel",
-    "incarnation",
-    "seq",
-    "t_send_ns",
-    "in_range",
-    "lost",
-    "delay_ns",
-    "duplicate",
-    "cause",
-    "corrupted",
-)
-
-
-def fate_row(record: FateRecord) -> list[Any]:
-    """A line of the fate log; columns as in FATE_COLUMNS."""
-    return [int(value) if isinstance(value, bool) else value for value in (getattr(record, n) for n in FATE_COLUMNS)]
 
 
 def estimate_bytes(estimate: Estimate) -> bytes:

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import csv
 from collections import Counter
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from agent.clock_faults import FaultyClock
 from agent.effects import Effect, Publish, Send
 from agent.events import Event, Received
+from agent.fault_parts import BiasPart, ClockDriftPart, ClockStepPart, DropoutPart, OutliersPart, SilencePart
 from agent.recording import RecordingError, merge, read_boundary, unpack
-from agent.shell import FATE_COLUMNS
-from deploy.launch import Outcome
+from deploy.launch import Outcome, life_files
+from network.links import FATE_COLUMNS
 from network.messages import PairReply, ReplyStatus
+from sim.agents import autopilot_fix
 from sim.bound import BoundRunner
 from sim.engine import TrialResult, network_figures
+from sim.fault_plan import trial_faults
+from sim.faulty_world import FaultyWorld
 from sim.sampling import MeasurementLog, Sampler, sample_stride
 from sim.scenario import Scenario
 from sim.world import World
@@ -24,8 +31,15 @@ MAX_BEHIND_STEPS = 1.5
 AHEAD_STEPS = 0.3
 
 
-def collect(scenario: Scenario, world: World, run_dir: Path, outcome: Outcome, with_bound: bool) -> TrialResult:
+def collect(
+    scenario: Scenario, world: World, run_dir: Path, outcome: Outcome, with_bound: bool, seed: int = 1
+) -> TrialResult:
     """A `TrialResult` as the virtual engine gives it, from recordings and what the agents said at their end."""
+    clocks = _clocks(scenario, seed, outcome.t0_ns)
+    sensed = FaultyWorld(world, seed, {robot.id: autopilot_fix(robot) for robot in scenario.robots})
+    for name, fault in trial_faults(scenario, seed).items():
+        if isinstance(fault, DropoutPart | OutliersPart | BiasPart | SilencePart):
+            sensed.add(name, fault)
     sampler = Sampler(scenario, world, with_bound)
     contacts: list[tuple[float, str, str]] = []
     counters: dict[str, dict[str, int]] = {}
@@ -33,8 +47,8 @@ def collect(scenario: Scenario, world: World, run_dir: Path, outcome: Outcome, w
     rejected: Counter[str] = Counter()
     traffic: Counter[str] = Counter()
     for robot in world.robots:
-        path = run_dir / "agents" / f"{robot}.mcap"
-        _sample(sampler, world, robot, path, outcome.t0_ns, contacts)
+        paths = life_files(run_dir, robot, "mcap")
+        _sample(sampler, world, robot, paths, clocks.get(robot, FaultyClock()), outcome.t0_ns, contacts)
         figures: dict[str, Any] = outcome.figures.get(robot, {})
         counters[robot] = figures.get("counters", {})
         nis[robot] = {kind: (total, count) for kind, (total, count) in figures.get("nis", {}).items()}
@@ -47,7 +61,7 @@ def collect(scenario: Scenario, world: World, run_dir: Path, outcome: Outcome, w
     runner = BoundRunner(scenario, world) if with_bound else None
     measured = MeasurementLog()
     for k in range(world.steps + 1):
-        outputs = world.outputs(k) if k else []
+        outputs = sensed.outputs(k) if k else []
         measured.add(outputs)
         if runner is not None:
             if k:
@@ -68,8 +82,23 @@ def collect(scenario: Scenario, world: World, run_dir: Path, outcome: Outcome, w
     )
 
 
+def _clocks(scenario: Scenario, seed: int, t0_ns: int) -> dict[str, FaultyClock]:
+    """Clocks of the robots as they were injected."""
+    found: dict[str, FaultyClock] = {}
+    for fault in trial_faults(scenario, seed).values():
+        if isinstance(fault, ClockStepPart | ClockDriftPart):
+            found.setdefault(fault.robot, FaultyClock()).add(fault.clock(t0_ns))
+    return found
+
+
 def _sample(
-    sampler: Sampler, world: World, robot: str, path: Path, t0_ns: int, contacts: list[tuple[float, str, str]]
+    sampler: Sampler,
+    world: World,
+    robot: str,
+    paths: list[Path],
+    clock: FaultyClock,
+    t0_ns: int,
+    contacts: list[tuple[float, str, str]],
 ) -> None:
     """The last estimate published for each sampled instant, and the contacts the robot applied."""
     stride_ns = sample_stride(world.step_ns) * world.step_ns
@@ -89,16 +118,18 @@ def _sample(
 
     span = world.steps * world.step_ns
     try:
-        for event, packed in read_boundary(path, robot, unfinished=True):
+        boundaries = (read_boundary(path, robot, unfinished=True) for path in paths)
+        for event, packed in chain.from_iterable(boundaries):
             made = [unpack(data) for data in packed]
             for peer in _contacts(event, made):
                 contacts.append(((event.t_ns - t0_ns) * 1e-9, robot, peer))
             for effect in made:
                 if isinstance(effect, Publish):
-                    while latest is None and next_row * stride_ns + ahead < effect.estimate.t_ns - t0_ns:
+                    found = replace(effect.estimate, t_ns=clock.origin_ns(effect.estimate.t_ns))
+                    while latest is None and next_row * stride_ns + ahead < found.t_ns - t0_ns:
                         next_row += 1  # Before the robot knew where it is.
-                    settle(effect.estimate.t_ns - t0_ns)
-                    latest = effect.estimate
+                    settle(found.t_ns - t0_ns)
+                    latest = found
         if latest is not None:
             settle(min(latest.t_ns - t0_ns + behind, span + 2 * ahead))
     except RecordingError:
@@ -122,8 +153,7 @@ def _contacts(event: Event, effects: list[Effect]) -> list[str]:
 def _fates(scenario: Scenario, run_dir: Path) -> list[dict[str, str]]:
     rows: list[dict[str, str]] = []
     for robot in scenario.robots:
-        path = run_dir / "agents" / f"{robot.id}.fates.csv"
-        if path.exists():
+        for path in life_files(run_dir, robot.id, "fates.csv"):
             with path.open(newline="") as file:
                 rows += [dict(zip(FATE_COLUMNS, row)) for row in csv.reader(file) if len(row) == len(FATE_COLUMNS)]
     return rows
@@ -140,12 +170,13 @@ def merge_fates(scenario: Scenario, run_dir: Path) -> None:
         writer.writeheader()
         writer.writerows(rows)
     for robot in scenario.robots:
-        (run_dir / "agents" / f"{robot.id}.fates.csv").unlink(missing_ok=True)
+        for path in life_files(run_dir, robot.id, "fates.csv"):
+            path.unlink()
 
 
 def merge_recordings(scenario: Scenario, run_dir: Path) -> None:
     """One `recording.mcap` for the run; an agent that was killed leaves what it had written."""
-    paths = {robot.id: run_dir / "agents" / f"{robot.id}.mcap" for robot in scenario.robots}
-    merge({robot: [path] for robot, path in paths.items() if path.exists()}, run_dir / "recording.mcap")
-    for path in paths.values():
-        path.unlink(missing_ok=True)
+    paths = {robot.id: life_files(run_dir, robot.id, "mcap") for robot in scenario.robots}
+    merge({robot: lives for robot, lives in paths.items() if lives}, run_dir / "recording.mcap")
+    for path in chain.from_iterable(paths.values()):
+        path.unlink()

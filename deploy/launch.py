@@ -16,6 +16,8 @@ import signal
 import sys
 import tempfile
 import time
+import tomllib
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,10 +26,12 @@ from typing import Any
 import tomli_w
 
 from agent.estimation.motion import LAYOUTS
+from agent.fault_parts import AnyFaultPart, CrashPart, PausePart, RestartPart
 from agent.settings import NS
 from network.transport import free_port
 from network.zenoh_transport import link_pair
 from sim.agents import agent_tables, autopilot_fix, odometry_table, table
+from sim.fault_plan import trial_faults
 from sim.host import HostPlan, plan_json
 from sim.scenario import RobotPart, Scenario, sensor_kind
 from sim.world import World
@@ -64,6 +68,9 @@ class Member:
     done: dict[str, Any] | None = None
     exit_code: int | None = None
     heard_s: float = 0.0
+    life: int = 1
+    gone: bool = False
+    """A fault has ended it, which is no failure of the run."""
     reaper: asyncio.Task[None] | None = None
 
 
@@ -124,13 +131,33 @@ def agent_file(
         "injection": {
             "seed": seed,
             "links": table(scenario.links),
+            "faults": [
+                table(fault.model_copy(update={"id": name}))
+                for name, fault in trial_faults(scenario, seed).items()
+                if fault.level in ("link", "forgery", "clock")
+            ],
             "table": plan.link_endpoint,
-            "fate_log": str(run_dir / "agents" / f"{robot.id}.fates.csv"),
+            "fate_log": str(life_file(run_dir, robot.id, 1, "fates.csv")),
         },
         "state_dir": str(state_dir / robot.id),
-        "recording": str(run_dir / "agents" / f"{robot.id}.mcap"),
+        "recording": str(life_file(run_dir, robot.id, 1, "mcap")),
         "control_socket": plan.control_socket,
     }
+
+
+def life_file(run_dir: Path, robot: str, life: int, ending: str) -> Path:
+    """What a life of an agent leaves: the recording or the fate log of its first one, or of a later one."""
+    number = "" if life == 1 else f".{life}"
+    return run_dir / "agents" / f"{robot}{number}.{ending}"
+
+
+def life_files(run_dir: Path, robot: str, ending: str) -> list[Path]:
+    """Of all its lives, in order."""
+    found, life = [], 1
+    while (path := life_file(run_dir, robot, life, ending)).exists():
+        found.append(path)
+        life += 1
+    return found
 
 
 class Launcher:
@@ -144,11 +171,15 @@ class Launcher:
         self._changed = asyncio.Event()
         self._interrupted = False
         self._t0_ns = 0
+        self._begin: dict[str, int] | None = None
+        self._private = Path()
+        self._past: dict[str, list[dict[str, Any]]] = {}
+        self._nemesis: list[asyncio.Task[None]] = []
 
     async def run(self, show: Callable[[Launcher], None] | None = None) -> Outcome:
         """Run to the end. Raises `LaunchError` when the run could not start or the world failed."""
         # Sockets live in a short private path: their length is limited.
-        private = Path(tempfile.mkdtemp(prefix="cofix-"))
+        private = self._private = Path(tempfile.mkdtemp(prefix="cofix-"))
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, self._interrupt)
@@ -158,8 +189,16 @@ class Launcher:
             server = await asyncio.start_unix_server(self._serve, path=plan.control_socket, limit=2**22)
             await self._start(private)
             await self._barrier()
+            self._nemesis = [
+                asyncio.create_task(self._strike(name, fault))
+                for name, fault in trial_faults(self._scenario, self._seed).items()
+                if fault.level == "process"
+            ]
             await self._watch(show)
         finally:
+            for task in self._nemesis:
+                task.cancel()
+            await asyncio.gather(*self._nemesis, return_exceptions=True)
             await self._end()
             if server is not None:
                 server.close()
@@ -211,10 +250,10 @@ class Launcher:
             config = self._run_dir / "agents" / f"{robot.id}.toml"
             await self._spawn(robot.id, "-m", "deploy.cli", "agent", str(config))
 
-    async def _spawn(self, name: str, *arguments: str) -> None:
+    async def _spawn(self, name: str, *arguments: str, life: int = 1) -> None:
         log = self._run_dir / "logs" / f"{name}.log"
         environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
-        with log.open("wb") as output:
+        with log.open("ab" if life > 1 else "wb") as output:
             process = await asyncio.create_subprocess_exec(
                 sys.executable,
                 "-P",
@@ -225,7 +264,7 @@ class Launcher:
                 env=environment,
                 start_new_session=True,
             )
-        member = Member(name, process, log)
+        member = Member(name, process, log, life=life, heard_s=time.monotonic())
         self.members[name] = member
         member.reaper = asyncio.create_task(self._reap(member))
 
@@ -245,6 +284,8 @@ class Launcher:
                 member.writer = writer
                 member.heard_s = time.monotonic()
                 member.ready = member.ready or "ready" in message
+                if "ready" in message and self._begin is not None:
+                    self._tell(member, {"start": self._begin})
                 if "status" in message:
                     member.status = message["status"]
                 if "done" in message:
@@ -264,9 +305,69 @@ class Launcher:
                 raise LaunchError(f"{late} not ready after {READY_TIMEOUT_S:.0f} s; see {self._run_dir / 'logs'}")
             await self._wait(0.2)
         self._t0_ns = time.time_ns() // NS * NS
-        begin = {"t0_ns": self._t0_ns, "monotonic0_ns": time.monotonic_ns() + int(LEAD_S * NS)}
+        self._begin = {"t0_ns": self._t0_ns, "monotonic0_ns": time.monotonic_ns() + int(LEAD_S * NS)}
         for member in self.members.values():
-            self._tell(member, {"start": begin})
+            self._tell(member, {"start": self._begin})
+
+    # -- faults of processes --------------------------------------------------------------------------------
+
+    async def _until(self, at_s: float) -> None:
+        """Wait for an instant of the run, in seconds of fleet time since its start."""
+        assert self._begin is not None
+        due_ns = self._begin["monotonic0_ns"] + int(at_s / self._speed * NS)
+        await asyncio.sleep(max(due_ns - time.monotonic_ns(), 0) / NS)
+
+    async def _strike(self, name: str, fault: AnyFaultPart) -> None:
+        """Play a fault of a process."""
+        await self._until(fault.at_s)
+        match fault:
+            case CrashPart():
+                await self._kill(fault.robot, signal.SIGKILL)
+                if fault.for_s is not None:
+                    await self._until(fault.at_s + fault.for_s)
+                    await self._revive(fault.robot, fault.state == "kept")
+            case RestartPart():
+                await self._kill(fault.robot, signal.SIGTERM)
+                await self._until(fault.at_s + (fault.for_s or 0.0))
+                await self._revive(fault.robot, True)
+            case PausePart():
+                self._signal(fault.robot, signal.SIGSTOP)
+                try:
+                    await self._until(fault.at_s + fault.for_s)
+                finally:
+                    self._signal(fault.robot, signal.SIGCONT)
+
+    def _signal(self, robot: str, number: int) -> None:
+        member = self.members[robot]
+        if member.exit_code is None:
+            with contextlib.suppress(ProcessLookupError):
+                member.process.send_signal(number)
+
+    async def _kill(self, robot: str, number: int) -> None:
+        """End an agent, and wait until it is gone."""
+        member = self.members[robot]
+        member.gone = True
+        self._signal(robot, number)
+        if member.reaper is not None:
+            await member.reaper
+        if member.done is not None:
+            self._past.setdefault(robot, []).append(member.done)
+
+    async def _revive(self, robot: str, keep_state: bool) -> None:
+        """Start an agent again with its own file; what it writes besides its state goes to files of the new life."""
+        before = self.members[robot]
+        if not before.gone or before.exit_code is None:
+            return
+        if not keep_state:
+            shutil.rmtree(self._private / robot, ignore_errors=True)
+        life = before.life + 1
+        path = self._run_dir / "agents" / f"{robot}.toml"
+        tables = tomllib.loads(path.read_text())
+        tables["identity"]["incarnation"] = life
+        tables["recording"] = str(life_file(self._run_dir, robot, life, "mcap"))
+        tables["injection"]["fate_log"] = str(life_file(self._run_dir, robot, life, "fates.csv"))
+        path.write_text(tomli_w.dumps(tables))
+        await self._spawn(robot, "-m", "deploy.cli", "agent", str(path), life=life)
 
     # -- work and end ---------------------------------------------------------------------------------------
 
@@ -290,7 +391,9 @@ class Launcher:
 
     @staticmethod
     def _trouble(member: Member) -> str | None:
-        """What is wrong with a process, if anything."""
+        """What is wrong with a process, if anything; what a fault has done to it is not."""
+        if member.gone:
+            return None
         if member.exit_code is not None:
             return ended(member.exit_code, member.log)
         if time.monotonic() - member.heard_s > SILENT_S:
@@ -336,10 +439,31 @@ class Launcher:
             await self._wait(0.1)
 
     def _outcome(self) -> Outcome:
-        exits = {n: m.exit_code if m.exit_code is not None else -1 for n, m in self.members.items() if n != WORLD}
-        figures = {name: m.done for name, m in self.members.items() if m.done is not None and name != WORLD}
+        agents = {name: member for name, member in self.members.items() if name != WORLD}
+        exits = {name: 0 if m.gone else -1 if m.exit_code is None else m.exit_code for name, m in agents.items()}
+        figures = {}
+        for name, member in agents.items():
+            lives = [*self._past.get(name, []), *([member.done] if member.done and not member.gone else [])]
+            if lives:
+                figures[name] = summed(lives)
         world = self.members[WORLD].done or {}
         return Outcome(exits, figures, world, self._t0_ns, self._interrupted, self.messages)
+
+
+def summed(lives: list[dict[str, Any]]) -> dict[str, Any]:
+    """The figures of an agent over its lives: counts add up, the largest lag counts."""
+    total = dict(lives[0])
+    for figures in lives[1:]:
+        for key in ("counters", "rejected", "endpoint", "transport", "autopilot"):
+            total[key] = dict(Counter(total[key]) + Counter(figures[key]))
+        nis = {kind: list(entry) for kind, entry in total["nis"].items()}
+        for kind, (value, count) in figures["nis"].items():
+            entry = nis.setdefault(kind, [0.0, 0])
+            entry[0], entry[1] = entry[0] + value, entry[1] + count
+        total["nis"] = nis
+        total["lag_max_s"] = max(total["lag_max_s"], figures["lag_max_s"])
+        total["lags"] = total["lags"] + figures["lags"]
+    return total
 
 
 def describe_exit(code: int) -> str:

@@ -21,11 +21,10 @@ from agent.lateness_figures import LatenessFigures
 from agent.node import Recorder
 from agent.recording import RecordingWriter
 from agent.settings import NS
-from agent.shell import FATE_COLUMNS, fate_row
 from deploy.evaluate import collect, merge_fates, merge_recordings
 from deploy.launch import Launcher, LaunchError
 from deploy.status import LiveTable, Progress, print_summary
-from network.links import FateRecord
+from network.links import FATE_COLUMNS, FateRecord, fate_row
 from sim.agents import agent_config, table
 from sim.engine import TrialResult
 from sim.invariants import InvariantBreach, InvariantChecker
@@ -80,7 +79,7 @@ def run(options: argparse.Namespace) -> int:
             if figures:
                 lags.heard(round(figures["lag_max_s"] * 1e9), figures["lags"])
         lag_p99_s = lags.percentile_ns(0.99) * 1e-9
-        result = collect(scenario, world, run_dir, outcome, options.bound)
+        result = collect(scenario, world, run_dir, outcome, options.bound, options.seed)
         merge_recordings(scenario, run_dir)
         merge_fates(scenario, run_dir)
     steps = sorted(result.step_us)

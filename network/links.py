@@ -11,7 +11,7 @@ import math
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import msgpack
@@ -107,6 +107,14 @@ class FateRecord:
     duplicate: bool
     cause: str = ""
     corrupted: bool = False
+
+
+FATE_COLUMNS = tuple(field.name for field in fields(FateRecord))
+
+
+def fate_row(record: FateRecord) -> list[Any]:
+    """A line of the fate log; columns as in FATE_COLUMNS."""
+    return [int(value) if isinstance(value, bool) else value for value in (getattr(record, n) for n in FATE_COLUMNS)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,19 +20,23 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from agent.clock_faults import FaultyClock
 from agent.control import ControlLine
 from agent.estimation.motion import LAYOUTS
+from agent.fault_parts import BiasPart, ClockDriftPart, ClockStepPart, DropoutPart, OutliersPart, SilencePart
 from agent.fleet_clock import FleetClock
 from agent.sensor_input import encode
 from network.link_feed import LinkFeed
 from sim.agents import autopilot_fix
 from sim.autopilot import StandIn, StandInServer
+from sim.fault_plan import trial_faults
+from sim.faulty_world import FaultyWorld
 from sim.reach import Reach
 from sim.scenario import RobotPart
 from sim.scenario_file import load
 from sim.trial import open_world
 from sim.vehicle_telemetry import StandInSettings
-from sim.world import Output, World
+from sim.world import Output
 
 VEHICLES = {False: dialect.MAV_TYPE_GROUND_ROVER, True: dialect.MAV_TYPE_QUADROTOR}
 BOOT_LEAD_NS = 30_000_000_000
@@ -62,12 +66,14 @@ class WorldHost:
     def __init__(self, plan: HostPlan) -> None:
         self._plan = plan
         self._scenario = load(plan.scenario)
-        self._world: World = open_world(self._scenario, plan.seed)
+        self._fixes = {robot.id: autopilot_fix(robot) for robot in self._scenario.robots}
+        # A silent autopilot goes on moving: it is the stand-in that says nothing.
+        self._world = FaultyWorld(open_world(self._scenario, plan.seed), plan.seed, self._fixes, drop_silenced=False)
+        self._clocks: dict[str, FaultyClock] = {robot.id: FaultyClock() for robot in self._scenario.robots}
         links = self._scenario.links
         self._reach = None if links.range_m is None else Reach(self._world, links.range_m, links.hysteresis_m)
         self._feed = LinkFeed()
         self._parts: dict[str, RobotPart] = {robot.id: robot for robot in self._scenario.robots}
-        self._fixes = {robot.id: autopilot_fix(robot) for robot in self._scenario.robots}
         self._servers: dict[str, StandInServer] = {}
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
@@ -84,6 +90,7 @@ class WorldHost:
             assert control.started is not None
             begin = await control.started
             clock = FleetClock(begin["t0_ns"], begin["monotonic0_ns"], self._plan.speed)
+            self._inject(clock.t0_ns)
             await self._start_vehicles(clock)
             play = asyncio.ensure_future(self._play(clock, control))
             await asyncio.wait({play, stop}, return_when=asyncio.FIRST_COMPLETED)
@@ -105,6 +112,17 @@ class WorldHost:
             await control.close()
             with contextlib.suppress(TimeoutError):
                 await self._feed.close()
+
+    def _inject(self, t0_ns: int) -> None:
+        """The faults of sensors, autopilots and clocks; the rest is for receivers and the launcher."""
+        for name, fault in trial_faults(self._scenario, self._plan.seed).items():
+            match fault:
+                case DropoutPart() | OutliersPart() | BiasPart() | SilencePart():
+                    self._world.add(name, fault)
+                case ClockStepPart() | ClockDriftPart():
+                    self._clocks[fault.robot].add(fault.clock(t0_ns))
+                case _:
+                    pass
 
     async def _start_vehicles(self, clock: FleetClock) -> None:
         for index, (robot, port) in enumerate(sorted(self._plan.mavlink_ports.items())):
@@ -177,10 +195,12 @@ class WorldHost:
                 self._send_sensor(item, t_ns)
         for robot in moved:
             self._place(robot, k, t_ns)
-            self._servers[robot].push(t_ns)
+            if not self._world.silenced(robot, k * self._world.step_ns):
+                self._servers[robot].push(t_ns)
 
     def _send_sensor(self, item: Output, t_ns: int) -> None:
-        payload = encode(t_ns, item.kind, item.z, item.R, of=item.of, sensor=item.sensor, attitude=item.attitude)
+        stamp_ns = self._clocks[item.robot].local_ns(t_ns)
+        payload = encode(stamp_ns, item.kind, item.z, item.R, of=item.of, sensor=item.sensor, attitude=item.attitude)
         try:
             self._socket.sendto(payload, self._plan.sensor_sockets[item.robot])
         except OSError:
