@@ -7,6 +7,7 @@ hence shared from the start (see `agent.estimation.split_joint`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -36,6 +37,12 @@ RECURRING = 2e-3
 
 SAME_TARGET_M2 = 1e-4
 """Variance by which two robots' tracks are taken to be of one target."""
+
+UNKNOWN_RAD2 = 2.0 * math.pi**2 / 3.0
+"""Variance of a heading of which nothing is known, twice that of an error spread evenly over a turn."""
+
+INDIFFERENT_RAD2 = 2.25
+"""Variance of a heading from which on it is of no use, and a position is worth more than what is left of it."""
 
 CONTRADICTING = 9.0
 """NIS per degree of freedom of a sighting that does not agree with a track."""
@@ -79,8 +86,20 @@ class JointModel:
         """
         dt_s = (t_ns - state.t_ns) * 1e-9
         found = self._layout(state).moved(state.mean, state.cov, dt_s, delta, delta_cov)
-        split = state.split.mapped(found.F, found.own_noise, found.target_noise)
+        split = self._within_a_turn(state.split.mapped(found.F, found.own_noise, found.target_noise))
         return self.tracks.aged(replace(state, t_ns=t_ns, mean=found.mean, split=split), dt_s)
+
+    def _within_a_turn(self, split: Split) -> Split:
+        """The split with an own heading no less sure than one that is unknown: its error is within half a turn."""
+        heading = self._settings.layout.heading
+        assert heading is not None
+        variance = split.private[heading, heading] + split.shared[heading, heading]
+        if variance <= UNKNOWN_RAD2:
+            return split
+        scale = np.ones(len(split.private))
+        scale[heading] = math.sqrt(UNKNOWN_RAD2 / variance)
+        square = np.outer(scale, scale)
+        return Split(split.private * square, split.shared * square)
 
     # -- own measurements -----------------------------------------------------------------------------------
 
@@ -229,7 +248,10 @@ class JointModel:
         k = len(told.mean)
         private = told.private if trusted and told.private is not None else np.zeros((k, k))
         other, recurring = Split(private, told.cov - private), RECURRING * symmetrize(met.residual)
-        update = update_from_peer(state.split, other, H_own, H_other, met.R, recurring)
+        heading = self._settings.layout.heading
+        lost = heading is not None and state.cov[heading, heading] > INDIFFERENT_RAD2
+        indifferent = (heading,) if lost and heading is not None else ()
+        update = update_from_peer(state.split, other, H_own, H_other, met.R, recurring, indifferent)
         if update is not None:
             state = self._shifted(state, update.K @ met.nu, update.split)
             ages = zip(told.targets, told.ages_ns)

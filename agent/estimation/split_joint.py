@@ -12,6 +12,7 @@ since a metric that one unobservable direction dominates would refuse useful upd
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -98,7 +99,13 @@ def update_own_recurring(split: Split, H: Array, R: Array, recurring: Array) -> 
 
 
 def update_from_peer(
-    own: Split, other: Split, H_own: Array, H_other: Array, R: Array, recurring: Array | None = None
+    own: Split,
+    other: Split,
+    H_own: Array,
+    H_other: Array,
+    R: Array,
+    recurring: Array | None = None,
+    indifferent: Sequence[int] = (),
 ) -> SplitUpdate | None:
     """Use an innovation nu = H_own e_own + H_other e_other + v of two beliefs, for the own one only.
 
@@ -106,6 +113,7 @@ def update_from_peer(
     and the measurement noise are shared afterwards, since the peer may use the same innovation. None if no gain
     lowers the trace of P relative to the prior: the belief is better left alone. `recurring` (m, m): covariance of a
     part of v that comes on top of R and may be correlated with the own error in any way, but not with the other's.
+    `indifferent` components may become as unsure as they like: their variances don't count when gains are compared.
     """
     n = len(own.private)
     C_private, C_shared = own.private @ H_own.T, own.shared @ H_own.T
@@ -116,6 +124,11 @@ def update_from_peer(
     foreign = H_other @ other.private @ H_other.T + R
     independent = symmetrize(own_private + foreign)
     metric = inverse(own.cov)
+    if indifferent:
+        counted = np.setdiff1d(np.arange(n), indifferent)
+        square = np.ix_(counted, counted)
+        metric = np.zeros((n, n))
+        metric[square] = inverse(own.cov[square])
     factors = _factors(float(own_shared.trace()), float(other_shared.trace()))
     f_own, f_other = factors[:, 0, None, None], factors[:, 1, None, None]
     # One candidate per leading index; tr(metric K S K^T) = tr(S G) spares the (n, n) matrices of all but the best.
@@ -129,7 +142,7 @@ def update_from_peer(
     # (sx + sy)^2 is the least of X / w + Y / (1 - w).
     cost = (np.sqrt(X) + np.sqrt(Y)) ** 2 + rest
     best = int(cost.argmin())
-    if not cost[best] < n:
+    if not cost[best] < n - len(indifferent):
         return None
     ratio = math.sqrt(Y[best] / max(float(X[best]), SMALLEST))
     ratio = min(max(ratio, 1.0 / WIDEST), WIDEST)
