@@ -18,6 +18,9 @@ MANY_STEPS = 3
 STEPS_WITHIN_NS = 60 * 10**9
 """A clock that is set so often is of no use to anybody."""
 
+STEP_NS = 10_000_000
+"""Less than that is a crystal that drifts by more than it should."""
+
 SLACK_NS, FAR = 50_000_000, 5.0
 """Offsets up to that many deviations, and this on top, contradict nobody."""
 
@@ -64,7 +67,8 @@ class PeerClock:
             if apart_ns > exchange.error_ns(t4_ns) + best.error_ns(t4_ns) + 1:
                 self._exchanges.clear()
                 self.steps += 1
-                self._step_ns.append(t4_ns)
+                if apart_ns > STEP_NS:
+                    self._step_ns.append(t4_ns)
         self._exchanges.append(exchange)
         # Errors grow alike with time, so that which one is the least does not change with it.
         self._best = min(self._exchanges, key=lambda known: known.error_ns(t4_ns))
