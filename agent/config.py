@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -176,14 +177,17 @@ class AgentConfig(Part):
     def settings(self, start_ns: int) -> AgentSettings:
         """What the core is given when it starts at `start_ns`."""
         mean, cov = self.initial.belief(self.motion)
+        # The forms of the paper predict each step by itself.
+        persistent = self.localization.kind == "replica" or self.localization.form not in ("safe", "published")
+        targets = [target.settings() for target in self.targets]
         return AgentSettings(
             robot=self.identity.robot,
             start_ns=start_ns,
             mean=mean,
             cov=cov,
             source=self.initial.source,
-            motion=self.motion.settings(),
-            targets=tuple(target.settings() for target in self.targets),
+            motion=replace(self.motion.settings(), persistent=persistent),
+            targets=tuple(replace(item, motion=replace(item.motion, persistent=persistent)) for item in targets),
             landmarks={item.id: item.place() for item in self.landmarks},
             one_way_sensors=tuple(name for name, part in sorted(self.sensors.items()) if not part.two_way),
             localization=self.localization.settings(),

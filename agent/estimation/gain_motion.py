@@ -82,7 +82,8 @@ class GainMotion(RobotMotion):
         if transform == "jacobian":
             moved, F, G = _linearized(mean, increment)
             return Propagated(moved, F @ cov @ F.T + G @ noise @ G.T + walked, F)
-        found = moved_in_its_frame(mean, cov, increment, noise, UNICYCLE_GAINS.angles[0], (ALONG, TURN))
+        heading = UNICYCLE_GAINS.angles[0]
+        found = moved_in_its_frame(mean, cov, increment, noise, heading, (ALONG, TURN), self.persistent)
         return Propagated(found.mean, found.cov + walked, found.F)
 
 

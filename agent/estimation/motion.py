@@ -110,6 +110,7 @@ def advance(
     delta: Array,
     delta_cov: Array,
     transform: Transform,
+    persistent: bool = True,
 ) -> Propagated:
     """Move a unicycle belief (3,), (3, 3) by an odometry increment (4,) with covariance (4, 4).
 
@@ -125,7 +126,7 @@ def advance(
         G = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         moved[2] = wrap(moved[2])
         return Propagated(moved, F @ cov @ F.T + G @ noise @ G.T, F)
-    return moved_in_its_frame(mean, cov, increment, noise, 2)
+    return moved_in_its_frame(mean, cov, increment, noise, 2, persistent=persistent)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +144,7 @@ def advance_spatial(
     delta_cov: Array,
     transform: Transform,
     held: HeldAltitude | None = None,
+    persistent: bool = True,
 ) -> Propagated:
     """Move a belief of x, y, z, heading (4,), (4, 4) by an odometry increment (4,) with covariance (4, 4).
 
@@ -158,7 +160,7 @@ def advance_spatial(
         G[:2, :2] = [[cos, -sin], [sin, cos]]
         found = Propagated(moved, F @ cov @ F.T + G @ delta_cov @ G.T, F)
     else:
-        found = moved_in_its_frame(mean, cov, delta, delta_cov, 3)
+        found = moved_in_its_frame(mean, cov, delta, delta_cov, 3, persistent=persistent)
     if held is not None:
         found.mean[2] = held.altitude_m
         found.F[2, :] = 0.0
@@ -169,9 +171,13 @@ def advance_spatial(
 
 @dataclass(frozen=True, slots=True)
 class RobotMotion:
-    """How a robot's own state moves with its odometry; here x, y, heading."""
+    """How a robot's own state moves with its odometry; here x, y, heading.
+
+    `persistent`: a heading that is off stays off, see `agent.estimation.heading_moments`.
+    """
 
     layout: StateLayout = UNICYCLE
+    persistent: bool = True
 
     def advance(
         self,
@@ -183,7 +189,7 @@ class RobotMotion:
         transform: Transform,
         ) -> Propagated:
         """Belief (n,), (n, n) after an odometry increment (4,) with covariance (4, 4) over `dt_s` > 0 seconds."""
-        return advance(mean, cov, delta, delta_cov, transform)
+        return advance(mean, cov, delta, delta_cov, transform, self.persistent)
 
 
 PLANAR_MOTION = RobotMotion()
@@ -205,7 +211,7 @@ class SpatialMotion(RobotMotion):
         dt_s: float,
         transform: Transform,
         ) -> Propagated:
-        return advance_spatial(mean, cov, delta, delta_cov, transform, self.held)
+        return advance_spatial(mean, cov, delta, delta_cov, transform, self.held, self.persistent)
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,6 +234,7 @@ class TargetMotion:
     noise_step_s: float = 1.0
     damping_s: float = 2.0
     held: HeldAltitude | None = None
+    persistent: bool = True
 
     def drift(self, mean: Array, cov: Array, dt_s: float, transform: Transform) -> Propagated:
         """Belief (n,), (n, n) after `dt_s` > 0 seconds."""
@@ -238,8 +245,8 @@ class TargetMotion:
         delta = np.array([speed, 0.0, 0.0, turn])
         noise = np.diag([(self.noise_sigma[0] * scale) ** 2, 0.0, 0.0, (self.noise_sigma[1] * scale) ** 2])
         if self.layout is SPATIAL:
-            return advance_spatial(mean, cov, delta, noise, transform, self.held)
-        return advance(mean, cov, delta, noise, transform)
+            return advance_spatial(mean, cov, delta, noise, transform, self.held, self.persistent)
+        return advance(mean, cov, delta, noise, transform, self.persistent)
 
     def _drift_velocity(self, mean: Array, cov: Array, dt: float) -> Propagated:
         F, Q = velocity_step(self.layout, dt, self.damping_s)
