@@ -177,8 +177,9 @@ class AgentConfig(Part):
     def settings(self, start_ns: int) -> AgentSettings:
         """What the core is given when it starts at `start_ns`."""
         mean, cov = self.initial.belief(self.motion)
-        # The forms of the paper predict each step by itself.
-        persistent = self.localization.kind == "replica" or self.localization.form not in ("safe", "published")
+        # The paper predicts each step by itself; intersections of tracks leave room enough for what that misses.
+        form = self.localization.form if self.localization.kind == "clat" else None
+        own, theirs = form != "published", form not in ("safe", "published")
         targets = [target.settings() for target in self.targets]
         return AgentSettings(
             robot=self.identity.robot,
@@ -186,8 +187,8 @@ class AgentConfig(Part):
             mean=mean,
             cov=cov,
             source=self.initial.source,
-            motion=replace(self.motion.settings(), persistent=persistent),
-            targets=tuple(replace(item, motion=replace(item.motion, persistent=persistent)) for item in targets),
+            motion=replace(self.motion.settings(), persistent=own),
+            targets=tuple(replace(item, motion=replace(item.motion, persistent=theirs)) for item in targets),
             landmarks={item.id: item.place() for item in self.landmarks},
             one_way_sensors=tuple(name for name, part in sorted(self.sensors.items()) if not part.two_way),
             localization=self.localization.settings(),
