@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: run test check unit setup benchmark check-data clean
+.PHONY: run test check unit setup benchmark check-data check-long clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("cofix needs Python 3.11 or newer: make PYTHON=python3.11") if sys.version_info < (3, 11) else None'
@@ -35,6 +35,12 @@ unit: setup
 benchmark: setup
 	$(BIN)/python -m pip install -qq --editable '.[benchmarks]'
 	$(BIN)/python -m benchmarks
+
+# Thousands of seeds of random faults, invariants checked after every event. Results are kept in runs/check-long, and the same
+# command goes on where it stopped.
+check-long: setup
+	OPENBLAS_NUM_THREADS=1 $(BIN)/cofix montecarlo fault-plan --trials 2000 --check --out runs/check-long/field
+	OPENBLAS_NUM_THREADS=1 $(BIN)/cofix montecarlo fault-plan --trials 500 --check --set fault_plan.intensity=storm --out runs/check-long/storm
 
 # make check-data UTIAS7=FOLDER [TIERS=FOLDER]: the tests on recorded data, which is not part of the repository.
 check-data: setup
