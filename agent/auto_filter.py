@@ -28,6 +28,7 @@ from agent.events import LinkChange, Observation, Received
 from agent.joint_filter import JointFilter
 from agent.joint_room import has_room
 from agent.joint_tracks import JointState
+from agent.saved_state import SavedSplit
 from agent.settings import AgentSettings, TrackEnd
 from agent.split_filter import SplitFilter
 from network.messages import (
@@ -56,13 +57,26 @@ anybody who starts far from the truth; where they matter there are dozens.
 class AutoFilter:
     """The form `auto`; see `agent.cooperative_filter` for what each method is given."""
 
-    def __init__(self, settings: AgentSettings, counters: Counter[str], count_nis: CountNis) -> None:
+    keeps_factors = False
+    """Factors are not saved, hence nothing that peers rely on."""
+
+    def __init__(
+        self,
+        settings: AgentSettings,
+        counters: Counter[str],
+        count_nis: CountNis,
+        saved: SavedSplit | None = None,
+    ) -> None:
+        """`saved`: what to begin with; the form is `split_joint` then."""
         self._settings, self._counters, self._count_nis = settings, counters, count_nis
         self._joint: JointFilter | None = None
         self._active: CooperativeFilter
         self._lives: dict[str, LinkChange] = {}
         followed = [(target.id, target.motion.layout) for target in settings.tracked]
-        if settings.found_out:
+        if saved is not None:
+            self._active = SplitFilter(settings, counters, count_nis, saved)
+            self._why = "started from saved state"
+        elif settings.found_out:
             self._active = SplitFilter(settings, counters, count_nis)
             self._why = "the robot has not started with the others"
         elif settings.track_end != TrackEnd() or any(target.mean is None for target in settings.tracked):
@@ -137,18 +151,26 @@ class AutoFilter:
 
     def _hand_over(self, why: str) -> None:
         assert self._joint is not None
-        joint, state = self._joint, self._joint.state
-        tracks = tuple(track.target for track in joint.estimate().tracks)
-        split_cov = Split(np.zeros_like(state.cov), state.cov)
-        # When something was last learnt of a track is not kept with factors: not before the start is what is known.
-        learnt_ns = (self._settings.start_ns,) * len(tracks)
-        start = JointState(state.t_ns, state.mean, split_cov, tracks, learnt_ns)
-        split = SplitFilter(self._settings, self._counters, self._count_nis, start)
-        split.take_over(joint.contacts())
+        split = SplitFilter(self._settings, self._counters, self._count_nis, self._without_factors(self._joint))
         for event in self._lives.values():
             split.link_changed(event)
         self._joint, self._active, self._why = None, split, why
         self._counters["form.handed_over"] += 1
+
+    def _without_factors(self, joint: JointFilter) -> SavedSplit:
+        """The joint belief, all of it shared."""
+        state = joint.state
+        tracks = tuple(track.target for track in joint.estimate().tracks)
+        split_cov = Split(np.zeros_like(state.cov), state.cov)
+        # When something was last learnt of a track is not kept with factors: not before the start is what is known.
+        learnt_ns = (self._settings.start_ns,) * len(tracks)
+        return SavedSplit(JointState(state.t_ns, state.mean, split_cov, tracks, learnt_ns), joint.contacts())
+
+    def saved(self) -> SavedSplit:
+        if self._joint is not None:
+            return self._without_factors(self._joint)
+        assert isinstance(self._active, SplitFilter)
+        return self._active.saved()
 
     # -- peers ----------------------------------------------------------------------------------------------
 

@@ -198,6 +198,7 @@ class AgentConfig(Part):
             team=tuple(member.settings() for member in self.team),
             track_end=self.tracking.end(),
             track_within_m=self.tracking.start_within_m,
+            persist_ns=nanoseconds(self.state.interval_s),
         )
 
     def sensor_configs(self) -> dict[str, SensorConfig]:

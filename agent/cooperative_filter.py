@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from agent.effects import Effect, Estimate, Send
 from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.events import LinkChange, Observation, Received
+from agent.saved_state import Saved
 from network.messages import Body, Epoch, Measurement, PairReply, ReplyStatus
 
 Array = NDArray[np.float64]
@@ -105,4 +106,13 @@ class CooperativeFilter(Protocol):
 
     def form(self) -> tuple[str, str]:
         """Name of the form that is on, and why."""
+        ...
+
+    @property
+    def keeps_factors(self) -> bool:
+        """Whether what is saved must not be older than the last message of a contact."""
+        ...
+
+    def saved(self) -> Saved | None:
+        """What another filter of the form can begin with; None: nothing."""
         ...

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.cooperative_filter import CooperativeFilter
-from agent.effects import Alarm, Effect, Estimate, Publish, TrackEstimate
+from agent.effects import Alarm, Effect, Estimate, Persist, Publish, Send, TrackEstimate
 from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError, absolute_model, relative_model, told
 from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received, Tick
 from agent.forms import build_filter
+from agent.saved_state import decode, encode
 from agent.settings import AgentSettings
 from agent.timeline import MAX_INCREMENTS, MAX_WAITING, Item, OdometryTrack, Phase, Timeline
 from agent.waiting_filter import WaitingFilter
@@ -41,14 +42,21 @@ class NisSum:
 class Agent:
     """One robot's estimator. `handle` takes every event, `next_deadline_ns` says when to come back."""
 
-    def __init__(self, settings: AgentSettings) -> None:
+    def __init__(self, settings: AgentSettings, state: bytes | None = None) -> None:
+        """`state`: what a `Persist` of an earlier life has kept. Raises `StateError` if that can't be begun with."""
+        restored = None if state is None else decode(state, settings)
+        if restored is not None:
+            settings = restored.settings(settings)
         self.settings = settings
         self.counters: Counter[str] = Counter()
         self.nis: dict[str, NisSum] = {}
-        self.now_ns = settings.start_ns
+        self.now_ns = settings.start_ns if restored is None else restored.t_ns
         self._timeline = Timeline()
         self._odometry = OdometryTrack(settings.coast, settings.lateness.tolerance_ns, self.counters)
-        self.filter: CooperativeFilter = build_filter(settings, self.counters, self._count_nis)
+        saved = None if restored is None else restored.saved
+        self.filter: CooperativeFilter = build_filter(settings, self.counters, self._count_nis, saved)
+        self._persisted: object = None
+        self._persist_due_ns = self.now_ns
         self._published: object = None
         self._tracks: tuple[str, ...] = ()
         self._missing: tuple[str, ...] = ()
@@ -78,7 +86,26 @@ class Agent:
         if missing != self._missing:
             self._missing = missing
             effects.append(Alarm("waiting", "; ".join(missing)) if missing else Alarm("started"))
+        self._persist(effects)
         return effects
+
+    def _persist(self, effects: list[Effect]) -> None:
+        """Have the state kept: before messages that it must not be older than, and from time to time."""
+        first = next((index for index, effect in enumerate(effects) if isinstance(effect, Send)), None)
+        ahead = first is not None and self.filter.keeps_factors
+        due = self.now_ns >= self._persist_due_ns and self.filter.revision is not self._persisted
+        if not ahead and not due:
+            return
+        payload = self.saved()
+        if payload is None:
+            return
+        self._persisted, self._persist_due_ns = self.filter.revision, self.now_ns + self.settings.persist_ns
+        effects.insert(first if ahead and first is not None else len(effects), Persist(payload, ahead))
+
+    def saved(self) -> bytes | None:
+        """What is known now, for another life of this robot; None if it begins without."""
+        saved = self.filter.saved()
+        return None if saved is None else encode(self.settings, saved)
 
     def _tell_ends(self, tracks: tuple[str, ...], effects: list[Effect]) -> None:
         if tracks != self._tracks:

@@ -70,4 +70,15 @@ class Alarm:
     detail: str = ""
 
 
-Effect = Send | Broadcast | Publish | Alarm
+@dataclass(frozen=True, slots=True)
+class Persist:
+    """What the robot knows now, to be kept for its next start (`agent.saved_state`).
+
+    `ahead`: messages that follow are of contacts, and a state older than they are must not be begun with again.
+    """
+
+    payload: bytes
+    ahead: bool = False
+
+
+Effect = Send | Broadcast | Publish | Alarm | Persist

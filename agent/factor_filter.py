@@ -23,6 +23,7 @@ from agent.events import LinkChange, Observation, Received
 from agent.factor_model import AnySnapshot, FactorModel, SeparateModel
 from agent.history import History
 from agent.pairs import Pairs
+from agent.saved_state import SavedFactors
 from agent.settings import AgentSettings
 from agent.tracks import TrackRules
 from network.messages import Body, Epoch, Measurement, PairReply, PairRequest, SplitRequest, StartRequest
@@ -33,16 +34,25 @@ Array = NDArray[np.float64]
 class FactorFilter:
     """The forms `safe` and `published`; see `agent.cooperative_filter` for what each method is given."""
 
+    keeps_factors = True
+
     def __init__(
-        self, settings: AgentSettings, counters: Counter[str], count_nis: Callable[[str, float], None]
+        self,
+        settings: AgentSettings,
+        counters: Counter[str],
+        count_nis: Callable[[str, float], None],
+        saved: SavedFactors | None = None,
     ) -> None:
+        """`saved`: what to begin with, instead of what the settings say."""
         self._settings, self._counters, self._count_nis = settings, counters, count_nis
         self._motions = {t.id: t.motion for t in settings.targets}
         self._rules = TrackRules(settings)
         self.model = self._model()
-        self.state = self.model.initial()
+        self.state = self.model.initial() if saved is None else saved.state
         self.history = History(settings, self.model, self.state)
         self._pairs = Pairs(settings, self.model, counters, count_nis)
+        if saved is not None:
+            self._pairs.restore(saved)
 
     def _model(self) -> FactorModel:
         return SeparateModel(self._settings, self._counters)
@@ -77,6 +87,9 @@ class FactorFilter:
 
     def form(self) -> tuple[str, str]:
         return self._settings.localization.form, "configured"
+
+    def saved(self) -> SavedFactors:
+        return self._pairs.saved(self.state)
 
     # -- own information ------------------------------------------------------------------------------------
 

@@ -10,15 +10,28 @@ from agent.cooperative_filter import CooperativeFilter
 from agent.factor_filter import FactorFilter
 from agent.joint_filter import JointFilter
 from agent.replica_filter import ReplicaFilter
+from agent.saved_state import Saved, SavedFactors, SavedSplit
 from agent.settings import AgentSettings
 from agent.split_filter import SplitFilter
 from agent.waiting_filter import WaitingFilter
 
 
 def build_filter(
-    settings: AgentSettings, counters: Counter[str], count_nis: Callable[[str, float], None]
+    settings: AgentSettings,
+    counters: Counter[str],
+    count_nis: Callable[[str, float], None],
+    saved: Saved | None = None,
 ) -> CooperativeFilter:
-    """The filter of `settings.localization`; of a robot that does not know where it is, one that waits for it."""
+    """The filter of `settings.localization`; of a robot that does not know where it is, one that waits for it.
+
+    `saved`: what it begins with, which is of the form of the settings (`agent.saved_state.decode`).
+    """
+    if isinstance(saved, SavedFactors):
+        kept = JointFilter if settings.localization.form == "joint" else FactorFilter
+        return kept(settings, counters, count_nis, saved)
+    if isinstance(saved, SavedSplit):
+        split = AutoFilter if settings.localization.form == "auto" else SplitFilter
+        return split(settings, counters, count_nis, saved)
     if settings.source != "survey":
         return WaitingFilter(settings, counters)
     if settings.localization.kind == "replica":

@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+
 from agent.effects import Estimate, TrackEstimate
 from agent.events import Observation
 from agent.factor_filter import FactorFilter
 from agent.factor_model import FactorModel
 from agent.joint_factors import JointFactors
+from agent.saved_state import SavedFactors
+from agent.settings import AgentSettings
 
 
 class JointFilter(FactorFilter):
     """The form `joint`; see `agent.cooperative_filter` for what each method is given."""
+
+    def __init__(
+        self,
+        settings: AgentSettings,
+        counters: Counter[str],
+        count_nis: Callable[[str, float], None],
+        saved: SavedFactors | None = None,
+    ) -> None:
+        super().__init__(settings, counters, count_nis, saved)
+        if saved is not None:
+            self._factors.group, self._factors.nonlinearity = saved.group, saved.nonlinearity
+
+    def saved(self) -> SavedFactors:
+        return replace(super().saved(), group=self.group, nonlinearity=self.nonlinearity)
 
     @property
     def group(self) -> frozenset[str] | None:

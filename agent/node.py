@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from agent.core import Agent
-from agent.effects import Alarm, Broadcast, Effect, Estimate, Publish, Send
+from agent.effects import Alarm, Broadcast, Effect, Estimate, Persist, Publish, Send
 from agent.events import Event, LinkChange, Received, Tick
 from agent.sensor_input import SensorConfig, SensorError, decode
 from agent.settings import AgentSettings
@@ -20,11 +20,15 @@ Recorder = Callable[[Event, list[Effect]], None]
 
 @dataclass(slots=True)
 class Outgoing:
-    """What a shell has to carry out: packets to send and estimates to show."""
+    """What a shell has to carry out: a state to keep first, then packets to send, and estimates to show.
+
+    `persist` is the newest state, and `ahead` if a packet must not leave before one is kept that is as new.
+    """
 
     packets: list[Packet] = field(default_factory=list)
     estimates: list[Estimate] = field(default_factory=list)
     alarms: list[Alarm] = field(default_factory=list)
+    persist: Persist | None = None
 
 
 class Node:
@@ -40,9 +44,11 @@ class Node:
         software: str,
         sensors: dict[str, SensorConfig] | None = None,
         recorder: Recorder | None = None,
+        state: bytes | None = None,
     ) -> None:
+        """`state`: what to begin with, of a `Persist`. Raises `StateError` if that is impossible."""
         self.robot = settings.robot
-        self.agent = Agent(settings)
+        self.agent = Agent(settings, state)
         self.endpoint = Endpoint(
             robot=settings.robot, boot_id=boot_id, incarnation=incarnation, settings=endpoint, software=software
         )
@@ -107,6 +113,9 @@ class Node:
                     out.estimates.append(estimate)
                 case Alarm():
                     out.alarms.append(effect)
+                case Persist(payload, ahead):
+                    before = out.persist is not None and out.persist.ahead
+                    out.persist = Persist(payload, ahead or before)
 
     def _transmit(self, make: Callable[[], Packet], out: Outgoing) -> None:
         """A message that cannot be told (too large, or degenerate numbers) is counted, never fatal."""

@@ -17,7 +17,10 @@ Rules
 6. A contact at or before the last applied one is superseded; a repeated request of the last one is answered
    with the same reply and not applied again; an instant that has left the history is answered TOO_OLD.
 7. An answer other than OK proves that the responder did not apply the contact: its line is dropped.
-8. If the correlation can't be recovered from the two snapshots (a line was forgotten, a side has lost its factors)
+8. A robot that is started again with its factors, which are those of its last message at least, has the same
+   incarnation: what was pending is void on both sides, as if it had been lost, and nothing else changes. It no longer
+   has the replies it gave, so a repeated request of the last contact applied is left without an answer.
+9. If the correlation can't be recovered from the two snapshots (a line was forgotten, a side has lost its factors)
    both sides see that alike. Neither uses the measurement; each doubles its own covariance, once in a while at most,
    and the pair begins anew uncorrelated: blk(2 P_a, 2 P_b) bounds the joint covariance whatever the correlation.
 
@@ -33,7 +36,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from network.messages import Epoch, JointSnapshot, Measurement, PairReply, PairRequest, ReplyStatus, Snapshot
+from agent.saved_state import SavedExchange
+from network.messages import NEVER, Epoch, JointSnapshot, Measurement, PairReply, PairRequest, ReplyStatus, Snapshot
 
 
 class Step(Enum):
@@ -99,7 +103,8 @@ class PairExchange:
         self._interval_ns, self._timeout_ns, self._horizon_ns = interval_ns, timeout_ns, horizon_ns
         self._counter = 0
         self._last_reply: PairReply | None = None
-        self._last_opened: Pending | None = None
+        # The own latest request, and until when the peer may receive it.
+        self._opened, self._until_ns = NEVER, 0
         self.pending: Pending | None = None
 
     @property
@@ -123,7 +128,8 @@ class PairExchange:
         """Open a contact; the caller keeps an identity line for the request's epoch and sends the request."""
         self._counter += 1
         request = PairRequest(Epoch(t_ns, self._robot, self._counter), measurements, snapshot)
-        self.pending = self._last_opened = Pending(request, now_ns + self._timeout_ns, t_ns + self._horizon_ns)
+        self.pending = Pending(request, now_ns + self._timeout_ns, t_ns + self._horizon_ns)
+        self._opened, self._until_ns = request.epoch, self.pending.give_up_ns
         return request
 
     def requested(self, request: PairRequest, base: Epoch) -> Step:
@@ -131,6 +137,9 @@ class PairExchange:
         epoch = request.epoch
         if self._last_reply is not None and self._last_reply.epoch == epoch:
             return Step.REPEAT_REPLY
+        if base.met and epoch == base:
+            # Applied before a restart, and the answer is gone. A refusal would say that it was not applied.
+            return Step.IGNORE
         if base.met and epoch <= base:
             return Step.ANSWER_SUPERSEDED
         step = REQUEST_TABLE[self.pending is not None, self.is_low, self._crossed(request)]
@@ -143,11 +152,11 @@ class PairExchange:
 
         It can't have received that later than `give_up_ns`, so what was measured after that has not crossed it.
         """
-        own = self._last_opened
-        if own is None or request.epoch.t_meas_ns > own.give_up_ns:
+        own = self._opened
+        if not own.met or request.epoch.t_meas_ns > self._until_ns:
             return False
         told = request.snapshot
-        return told.base < own.epoch and all(line.epoch != own.epoch for line in told.lines)
+        return told.base < own and all(line.epoch != own for line in told.lines)
 
     def answered(self, reply: PairReply) -> PairReply:
         """Remember the reply given, for a repeated request."""
@@ -182,5 +191,17 @@ class PairExchange:
 
     def restarted(self) -> None:
         """The peer began a new life: nothing of the old one will be answered."""
-        self.pending = self._last_opened = None
-        self._last_reply = None
+        self.pending = self._last_reply = None
+        self._opened, self._until_ns = NEVER, 0
+
+    def resumed(self) -> None:
+        """The peer was started again and has kept its factors: it may not know what is pending. The line stays."""
+        self.pending = None
+
+    def saved(self) -> SavedExchange:
+        """What the own next life must remember."""
+        return SavedExchange(self._counter, self._opened, self._until_ns)
+
+    def restore(self, saved: SavedExchange) -> None:
+        """Go on after an earlier life of the own robot."""
+        self._counter, self._opened, self._until_ns = saved.counter, saved.opened, saved.until_ns

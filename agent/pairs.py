@@ -18,6 +18,7 @@ from agent.factor_model import AnySnapshot, FactorModel
 from agent.history import History
 from agent.pair_clock import PairClocks
 from agent.pairing import PairExchange, Step
+from agent.saved_state import SavedFactors
 from agent.settings import AgentSettings
 from network.messages import MAX_MEASUREMENTS, Epoch, Measurement, PairReply, PairRequest, ReplyStatus, StartRequest
 
@@ -54,6 +55,18 @@ class Pairs:
                 self._settings.lateness.horizon_ns,
             )
         return self._exchanges[peer]
+
+    def saved(self, state: RobotState) -> SavedFactors:
+        """The newest state with what the next life of this robot must remember."""
+        exchanges = {peer: exchange.saved() for peer, exchange in self._exchanges.items()}
+        return SavedFactors(state, exchanges, dict(self._lives), dict(self._inflated_ns))
+
+    def restore(self, saved: SavedFactors) -> None:
+        """Remember what an earlier life has saved. Its requests are not waited for; their lines stay."""
+        for peer, kept in saved.exchanges.items():
+            self.exchange(peer).restore(kept)
+        self._lives.update(saved.lives)
+        self._inflated_ns.update(saved.inflated_ns)
 
     def deadline_ns(self) -> int:
         """When the first pending request times out."""
@@ -119,6 +132,8 @@ class Pairs:
         exchange = self.exchange(peer)
         step = exchange.requested(request, state.pair(peer).base)
         self._counters[f"pair.request_{step.value}"] += 1
+        if step is Step.IGNORE:
+            return state
         if step is Step.REPEAT_REPLY and exchange.last_reply is not None:
             effects.append(Send(peer, epoch.t_meas_ns, exchange.last_reply))
             return state
@@ -185,8 +200,10 @@ class Pairs:
         )
 
     def link_changed(self, event: LinkChange, state: RobotState, history: History) -> RobotState:
-        """A peer appeared, fell silent or began a new life; a new life restarts the pair.
+        """A peer appeared, fell silent or was started again.
 
+        With the same incarnation it has kept its factors: only what is pending is void. A new incarnation is a new
+        life, which restarts the pair.
         Joint covariance <= blk(2 P_a, 2 P_b) whatever the correlation, so both sides double their own and start
         from P_ab = 0. A peer that restarts again within `restart_interval_ns` is not allowed to inflate us
         once more: its correlation is taken for unknown instead.
@@ -195,6 +212,10 @@ class Pairs:
         before = self._lives.get(event.peer)
         self._lives[event.peer] = life
         if before is None or before == life:
+            return state
+        if before[0] == event.incarnation:
+            self._counters["pair.resumed"] += 1
+            self.exchange(event.peer).resumed()
             return state
         self.exchange(event.peer).restarted()
         if not state.pair(event.peer).base.met and not state.pair(event.peer).lines:

@@ -2,7 +2,7 @@
 
 A recording holds the agent's configuration too, so it can be played back into a core anywhere; on one machine
 the effects come out bit for bit the same. Topics: `<robot>/events`, `<robot>/effects`, and `<robot>/lives` for starts
-after the first; message encoding msgpack.
+of a robot that has lived before; message encoding msgpack.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from agent import effects as effect_types
 from agent import events as event_types
 from agent.config import AgentConfig
 from agent.core import Agent
-from agent.effects import Effect, Estimate
+from agent.effects import Effect, Persist
 from agent.events import Event
-from agent.saved_state import restarted
+from agent.saved_state import begun_again
 from network import messages as message_types
 
 _TYPES: dict[str, type] = {
@@ -74,6 +74,11 @@ def _object(value: Any) -> Any:
     return _TYPES[name](**{key: _object(item) for key, item in value.items() if key != "@"})
 
 
+def _recorded(effects: list[Effect]) -> list[Effect]:
+    """Effects but the states to be kept: they are large, and a replay makes them again."""
+    return [effect for effect in effects if not isinstance(effect, Persist)]
+
+
 def pack(value: Event | Effect) -> bytes:
     """An event or effect as bytes; arrays keep every bit."""
     data: bytes = msgpack.packb(_plain(value))
@@ -103,14 +108,14 @@ class RecordingWriter:
             f"agent/{robot}", {"config": json.dumps(config.model_dump()), "start_ns": str(start_ns)}
         )
 
-    def begin_life(self, robot: str, t_ns: int, saved: Estimate | None) -> None:
-        """The robot has started again, with the estimate it had saved or with none."""
-        self._add(f"{robot}/lives", t_ns, msgpack.packb(_plain(saved)))
+    def begin_life(self, robot: str, t_ns: int, state: bytes | None) -> None:
+        """A robot that has lived before begins, with the state it has kept or with none."""
+        self._add(f"{robot}/lives", t_ns, msgpack.packb(state))
 
     def record(self, robot: str, event: Event, effects: list[Effect]) -> None:
         """One call of a core."""
         self._add(f"{robot}/events", event.t_ns, pack(event))
-        for effect in effects:
+        for effect in _recorded(effects):
             self._add(f"{robot}/effects", event.t_ns, pack(effect))
 
     def _add(self, topic: str, t_ns: int, data: bytes) -> None:
@@ -166,16 +171,16 @@ def read_boundary(path: Path, robot: str, unfinished: bool = False) -> Iterator[
             yield what
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class Life:
-    """A robot's start after the first: the instant it was made at, and the estimate it had saved."""
+    """The start of a robot that has lived before, and the state it has kept."""
 
     t_ns: int
-    saved: Estimate | None
+    state: bytes | None
 
 
 def read_lives(path: Path, robot: str, unfinished: bool = False) -> Iterator[Life | tuple[Event, list[bytes]]]:
-    """What `read_boundary` tells, and between that the starts after the first."""
+    """What `read_boundary` tells, and between that the starts of a robot that has lived before."""
     topics: dict[int, str] = {}
     event: Event | None = None
     followed: list[bytes] = []
@@ -193,7 +198,7 @@ def read_lives(path: Path, robot: str, unfinished: bool = False) -> Iterator[Lif
                 if topic == f"{robot}/events":
                     event = _event(path, record.data)
                 else:
-                    yield Life(record.log_time, _object(msgpack.unpackb(record.data)))
+                    yield Life(record.log_time, msgpack.unpackb(record.data))
     if event is not None:
         yield event, followed
 
@@ -222,10 +227,10 @@ def replay(path: Path, robot: str) -> tuple[int, int, int | None]:
     for what in read_lives(path, robot):
         if isinstance(what, Life):
             settings = config.settings(start_ns)
-            agent = Agent(settings if what.saved is None else restarted(settings, what.saved))
+            agent = Agent(settings if what.state is not None else begun_again(settings), what.state)
             continue
         event, recorded = what
-        made = [pack(effect) for effect in agent.handle(event)]
+        made = [pack(effect) for effect in _recorded(agent.handle(event))]
         if made != recorded:
             return events, effects, events
         events += 1
@@ -244,7 +249,7 @@ def merge(paths: dict[str, list[Path]], target: Path) -> None:
         for path in lives:
             for what in read_lives(path, robot, unfinished=True):
                 if isinstance(what, Life):
-                    writer.begin_life(robot, what.t_ns, what.saved)
+                    writer.begin_life(robot, what.t_ns, what.state)
                 else:
                     writer.record(robot, what[0], [unpack(data) for data in what[1]])
     writer.close()

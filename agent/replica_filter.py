@@ -18,6 +18,7 @@ from agent.effects import Broadcast, Effect, Estimate, TrackEstimate
 from agent.estimation.observation import AbsoluteModel, RelativeModel, levelled, told
 from agent.events import LinkChange, Observation, Received
 from agent.pair_clock import PairClocks
+from agent.saved_state import Saved
 from agent.settings import AgentSettings
 from agent.team_history import OWN, Belief, Datum, Fate, TeamHistory
 from agent.team_teller import Teller
@@ -44,6 +45,8 @@ FAR_FUTURE_NS = 2**62
 
 class ReplicaFilter:
     """The kind `replica`; see `agent.cooperative_filter` for what each method is given."""
+
+    keeps_factors = False
 
     def __init__(
         self, settings: AgentSettings, counters: Counter[str], count_nis: Callable[[str, float], None]
@@ -85,6 +88,10 @@ class ReplicaFilter:
         silent = [name for name in self._others() if not self._present(name)]
         told_of = f"silent: {', '.join(silent)}" if silent else "everybody is heard"
         return "replica", f"configured; {told_of}"
+
+    def saved(self) -> Saved | None:
+        """Nothing: the belief follows from raw data, which the team tells no more."""
+        return None
 
     def _others(self) -> tuple[str, ...]:
         return tuple(name for name in self._history.robots if name != self._settings.robot)

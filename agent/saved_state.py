@@ -1,158 +1,401 @@
-"""What a robot keeps across starts: how often it has started, and its last estimate.
+"""What a robot knows, as bytes it can begin with again: written by the core, read with every limit.
 
-A start is a new life: a new boot id and a new incarnation, so peers forget what they were waiting for. From a saved
-estimate the robot begins at the instant it is of, and coasts from there until odometry comes: it does not know how it
-moved meanwhile. Peers may hold what the estimate was made of, and what was learnt after it was saved, hence
+Who keeps correlation factors (`safe`, `published`, `joint`) goes on with them. That needs bytes that are not older than
+the last message of a contact: what peers have been told is in them as lines and bases then, and what was learnt since
+is forgotten by one side only, as if a reply had been lost (`agent.pairing`). The shell writes before it sends.
 
-    split_joint, auto       the whole covariance counts as shared, correlated with everybody's in an unknown way
-    safe, published, joint  the own covariance is doubled and so is that of peers (`agent.pairs`): blk(2 P_a, 2 P_b)
-                            bounds the joint covariance whatever the correlation
+Who keeps none (`split_joint`, and `auto` whatever its form was) begins with its belief, all of which counts as shared,
+correlated with everybody's in an unknown way. That holds however old the bytes are and whatever was said since.
 
-Either is sound however old the estimate is. So no correlation factor is ever written down, nothing has to be on disk
-before a message leaves, and a power cut costs accuracy alone.
+Either way the state is of its instant, and the robot coasts from there: it does not know how it moved meanwhile.
+
+Without usable bytes a robot begins a new life, and `begun_again` says with what belief. Kind `replica` always does: its
+belief follows from raw data, which its team tells no more.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from hashlib import blake2b
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.effects import Estimate, TrackEstimate
+from agent.belief import BlockKey, CorrelationStack, PairRecord, Part, RobotState, TargetState
 from agent.estimation.gaussian import is_positive_definite
-from agent.estimation.motion import STATES
+from agent.estimation.split_joint import Split
+from agent.joint_layout import JointLayout
+from agent.joint_tracks import JointState, RelayedTrack
 from agent.settings import AgentSettings
-from network.wire_fields import MAX_INT, valid_id
+from network.messages import MAX_GROUP, MAX_JOINT_DIM, NEVER, Epoch
+from network.peers import MAX_PEERS
+from network.wire_fields import (
+    MAX_INT,
+    WireError,
+    pack_epoch,
+    read_array,
+    read_contact,
+    read_epoch,
+    read_fields,
+    read_id,
+    read_integer,
+    read_items,
+    read_text,
+)
 
 Array = NDArray[np.float64]
 
-MAGIC = b"cofix state 1\n"
-DIGEST_BYTES = 16
-MAX_BYTES = 1_000_000
+FORMAT = 1
+MAX_BYTES = 4_000_000
 MAX_TRACKS = 256
-MAX_INCARNATION = 2**53
+ASYMMETRY = 1e-9
+"""Rounding, relative to the largest element, by which a covariance may be asymmetric."""
 
 
 class StateError(ValueError):
-    """A saved state that cannot be used; `reason` names why and contains nothing of it."""
+    """A saved state that cannot be used; `reason` names why and contains nothing of it.
+
+    Of a file: `torn`, `corrupt` (checksum), `unreadable`. Of its content: `other_version`, `other_robot`, `other_form`,
+    `other_model`, `inconsistent`, and the reasons of `network.wire_fields.WireError`. Of its instant: `too_old`,
+    `from_future`, `earlier_run`.
+    """
 
     def __init__(self, reason: str) -> None:
         self.reason = reason
         super().__init__(reason)
 
 
-def encode(robot: str, incarnation: int, estimate: Estimate | None) -> bytes:
-    """The bytes of a state file."""
-    told: Any = None
-    if estimate is not None:
-        tracks = [[track.target, *_belief(track.model, track.mean, track.cov)] for track in estimate.tracks]
-        told = [estimate.t_ns, *_belief(estimate.model, estimate.mean, estimate.cov), tracks]
-    body: bytes = msgpack.packb([robot, incarnation, told])
-    return MAGIC + blake2b(body, digest_size=DIGEST_BYTES).digest() + body
+@dataclass(frozen=True, slots=True, eq=False)
+class SavedExchange:
+    """Of the protocol with one peer: contacts opened so far, the last one, and until when the peer may receive it."""
+
+    counter: int
+    opened: Epoch = NEVER
+    until_ns: int = 0
 
 
-def _belief(model: str, mean: Array, cov: Array) -> list[Any]:
-    return [model, np.asarray(mean, "<f8").tobytes(), np.asarray(cov, "<f8").tobytes()]
+@dataclass(frozen=True, slots=True, eq=False)
+class SavedFactors:
+    """A belief with correlation factors, and what the pair protocol must remember, by peer.
 
-
-def decode(payload: bytes, robot: str) -> tuple[int, Estimate | None]:
-    """(incarnation, estimate) of a state file of `robot`. Raises `StateError`.
-
-    Reasons: `torn` (cut or too long), `other_version`, `corrupt`, `other_robot`, `malformed`.
+    `lives`: (incarnation, boot id). `inflated_ns`: when a peer has last begun anew. The rest is of the form `joint`.
     """
-    if len(payload) > MAX_BYTES or len(payload) < len(MAGIC) + DIGEST_BYTES:
-        raise StateError("torn")
-    if not payload.startswith(MAGIC):
-        raise StateError("other_version" if payload.startswith(b"cofix state ") else "corrupt")
-    digest, body = payload[len(MAGIC) :][:DIGEST_BYTES], payload[len(MAGIC) + DIGEST_BYTES :]
-    if blake2b(body, digest_size=DIGEST_BYTES).digest() != digest:
-        raise StateError("corrupt")
+
+    state: RobotState
+    exchanges: dict[str, SavedExchange] = field(default_factory=dict)
+    lives: dict[str, tuple[int, int]] = field(default_factory=dict)
+    inflated_ns: dict[str, int] = field(default_factory=dict)
+    group: frozenset[str] | None = None
+    nonlinearity: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SavedSplit:
+    """A belief all of which counts as shared, and the last contact used, by peer.
+
+    `until_ns`: what peers have asked at instants up to then may be in the belief; None: it is not.
+    """
+
+    state: JointState
+    contacts: dict[str, Epoch] = field(default_factory=dict)
+    until_ns: int | None = None
+
+
+Saved = SavedFactors | SavedSplit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Restored:
+    """A state that fits its settings. `start_ns`: when the robot first started, which may be long ago."""
+
+    start_ns: int
+    saved: Saved
+
+    @property
+    def t_ns(self) -> int:
+        """The instant it is of."""
+        return self.saved.state.t_ns
+
+    def check_age(self, now_ns: int, max_age_ns: int, run_ns: int | None = None) -> None:
+        """Raises `StateError` if it is not of the time before `now_ns`, or of before the run began at `run_ns`."""
+        if run_ns is not None and self.t_ns < run_ns:
+            raise StateError("earlier_run")
+        if self.t_ns > now_ns:
+            raise StateError("from_future")
+        if now_ns - self.t_ns > max_age_ns:
+            raise StateError("too_old")
+
+    def settings(self, settings: AgentSettings) -> AgentSettings:
+        """Those of a robot that knows where it is, and has for some time."""
+        return replace(settings, source="survey", start_ns=self.start_ns, shared=None, found_out=True)
+
+
+def begun_again(settings: AgentSettings) -> AgentSettings:
+    """The settings of a new life that begins with the survey its last life began with too.
+
+    The robot coasts from the survey's instant to now, it does not pretend to be there still. Peers may have learnt of
+    the survey's error in the last life. Factors: they double their covariance when they see the new life (P_ab = 0 from
+    then on, `agent.pairs`), and this side is doubled here: blk(2 P_a, 2 P_b) bounds the joint covariance. Otherwise the
+    whole belief counts as shared. A fix, or a place that a peer tells, is new information, and needs nothing.
+    """
+    localization = settings.localization
+    if settings.source != "survey" or localization.kind == "replica":
+        return settings
+    if localization.form in ("auto", "split_joint"):
+        return replace(settings, shared=settings.cov, found_out=True)
+    if localization.form != "joint":
+        return replace(settings, cov=2.0 * settings.cov)
+    targets = tuple(replace(target, cov=2.0 * target.cov) for target in settings.targets)
+    return replace(settings, cov=2.0 * settings.cov, targets=targets)
+
+
+# -- writing --------------------------------------------------------------------------------------------------
+
+
+def encode(settings: AgentSettings, saved: Saved) -> bytes:
+    """The bytes of a state of a robot of these settings."""
+    if isinstance(saved, SavedFactors):
+        form, body = settings.localization.form, _factors(settings, saved)
+    else:
+        form, body = "split_joint", _split(settings, saved)
+    state = saved.state
+    head = FORMAT, settings.robot, form, settings.layout.name, settings.start_ns, state.t_ns
+    payload: bytes = msgpack.packb([*head, _bytes(state.mean), _bytes(saved.state.cov), body])
+    return payload
+
+
+def _bytes(array: Array) -> bytes:
+    return np.ascontiguousarray(array, "<f8").tobytes()
+
+
+def _factors(settings: AgentSettings, saved: SavedFactors) -> list[Any]:
+    state = saved.state
+    models = JointLayout(settings).models if settings.localization.form == "joint" else ()
+    known = {target.id: target.motion.layout.name for target in settings.targets}
+    targets = [
+        [name, known[name], _bytes(item.mean), _bytes(item.cov), item.updated_ns, item.learnt_ns]
+        for name, item in state.targets.items()
+    ]
+    blocks = [
+        [int(part), peer, pack_epoch(epoch), end - begin, _bytes(state.stack.matrix[:, begin:end])]
+        for (part, peer, epoch), (begin, end) in state.stack.blocks.items()
+    ]
+    exchanges = [
+        [peer, item.counter, pack_epoch(item.opened), item.until_ns] for peer, item in saved.exchanges.items()
+    ]
+    return [
+        [list(item) for item in models],
+        targets,
+        blocks,
+        [[peer, *_record(record)] for peer, record in state.pairs.items()],
+        _record(state.stranger),
+        exchanges,
+        [[peer, *life] for peer, life in saved.lives.items()],
+        [list(item) for item in saved.inflated_ns.items()],
+        None if saved.group is None else sorted(saved.group),
+        saved.nonlinearity,
+    ]
+
+
+def _record(record: PairRecord) -> list[Any]:
+    return [pack_epoch(record.base), record.known, [pack_epoch(epoch) for epoch in record.lines], record.anew]
+
+
+def _split(settings: AgentSettings, saved: SavedSplit) -> list[Any]:
+    state = saved.state
+    known = {target.id: target.motion.layout.name for target in settings.targets}
+    relayed = [
+        [name, known[name], _bytes(item.mean), _bytes(item.cov), item.learnt_ns, item.firm]
+        for name, item in state.relayed.items()
+    ]
+    return [
+        [[name, known[name], learnt_ns] for name, learnt_ns in zip(state.tracks, state.learnt_ns)],
+        relayed,
+        [list(item) for item in state.doubted.items()],
+        [[peer, pack_epoch(epoch)] for peer, epoch in saved.contacts.items()],
+    ]
+
+
+# -- reading --------------------------------------------------------------------------------------------------
+
+
+def decode(payload: bytes, settings: AgentSettings) -> Restored:
+    """The state for a robot of these settings. Raises `StateError`."""
+    if len(payload) > MAX_BYTES:
+        raise StateError("oversize")
     try:
-        raw = msgpack.unpackb(body, use_list=True, max_map_len=0, max_ext_len=0)
-    except (ValueError, TypeError, msgpack.UnpackException):
-        raise StateError("malformed") from None
-    name, incarnation, told = _fields(raw, 3)
-    if name != robot:
+        return _decoded(msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0), settings)
+    except WireError as error:
+        raise StateError(error.reason) from None
+    except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
+        raise StateError(error.reason if isinstance(error, StateError) else "malformed") from None
+
+
+def _decoded(raw: Any, settings: AgentSettings) -> Restored:
+    if type(raw) is not tuple or not raw or type(raw[0]) is not int:
+        raise StateError("malformed")
+    if raw[0] != FORMAT:
+        raise StateError("other_version")
+    _, robot, form, model, start, instant, mean, cov, body = read_fields(raw, 9)
+    localization = settings.localization
+    if read_id(robot) != settings.robot:
         raise StateError("other_robot")
-    if type(incarnation) is not int or not 1 <= incarnation < MAX_INCARNATION:
-        raise StateError("malformed")
-    return incarnation, None if told is None else _estimate(told)
+    expected = "split_joint" if localization.form == "auto" else localization.form
+    if localization.kind != "clat" or read_text(form) != expected:
+        raise StateError("other_form")
+    if read_text(model) != settings.layout.name:
+        raise StateError("other_model")
+    start_ns, t_ns = _stamp(start), _stamp(instant)
+    if start_ns > t_ns:
+        raise StateError("inconsistent")
+    read = _read_split if expected == "split_joint" else _read_factors
+    return Restored(start_ns, read(settings, t_ns, mean, cov, body))
 
 
-def _fields(raw: Any, count: int) -> list[Any]:
-    if type(raw) is not list or len(raw) != count:
-        raise StateError("malformed")
+def _read_factors(settings: AgentSettings, t_ns: int, mean: Any, cov: Any, body: Any) -> SavedFactors:
+    models, targets, blocks, pairs, stranger, exchanges, lives, inflated, group, nonlinearity = read_fields(body, 10)
+    joint = JointLayout(settings) if settings.localization.form == "joint" else None
+    if models != (() if joint is None else joint.models):
+        raise StateError("other_model")
+    n = settings.layout.dim if joint is None else joint.state.dim
+    c = n - settings.layout.dim
+    state = RobotState(
+        t_ns,
+        read_array(mean, n).copy(),
+        _cov(cov, n),
+        _read_stack(blocks, n),
+        _by_id(pairs, 4, lambda fields: _read_record(fields, settings.localization.max_lines)),
+        _targets(settings, targets, lambda mean, cov, f: TargetState(mean, cov, _stamp(f[0]), _stamp(f[1]))),
+        _read_record(read_fields(stranger, 4), 0),
+    )
+    if state.targets and joint is not None:
+        raise StateError("inconsistent")
+    _check_stack(state, n, c, joint is not None)
+    if type(nonlinearity) is not float or not 0.0 <= nonlinearity <= MAX_INT:
+        raise StateError("out_of_range")
+    return SavedFactors(
+        state,
+        _by_id(exchanges, 3, lambda f: SavedExchange(read_integer(f[0]), read_epoch(f[1]), _stamp(f[2]))),
+        _by_id(lives, 2, lambda f: (read_integer(f[0]), read_integer(f[1]))),
+        _by_id(inflated, 1, lambda f: _stamp(f[0])),
+        None if group is None else frozenset(read_id(item) for item in read_items(group, MAX_GROUP)),
+        nonlinearity,
+    )
+
+
+def _read_stack(raw: Any, n: int) -> CorrelationStack:
+    found: dict[BlockKey, tuple[int, int]] = {}
+    parts, column = [np.zeros((n, 0))], 0
+    for item in _items(raw):
+        part, peer, epoch, width, data = read_fields(item, 5)
+        key = Part(read_integer(part, max(Part))), read_text(peer) and read_id(peer), read_epoch(epoch)
+        if key in found:
+            raise StateError("inconsistent")
+        columns = read_integer(width, 2 * MAX_JOINT_DIM)
+        parts.append(read_array(data, n * columns).reshape(n, columns))
+        found[key] = (column, column + columns)
+        column += columns
+    return CorrelationStack(np.concatenate(parts, axis=1), found)
+
+
+def _check_stack(state: RobotState, n: int, c: int, joint: bool) -> None:
+    """Raises `StateError` unless there are exactly the blocks that the pairs' records speak of, of the right sizes."""
+    due: dict[BlockKey, range] = {}
+    line = range(n + c, n + c + 1)
+    if joint:
+        due[Part.COMMON, "", NEVER] = range(2 * c, 2 * c + 1)
+    for peer, record in state.pairs.items():
+        if record.base.met:
+            due[Part.FACTOR, peer, NEVER] = range(1, MAX_JOINT_DIM + 1)
+            due[Part.BASE_LINE, peer, NEVER] = line
+        due |= {(Part.LINE, peer, epoch): line for epoch in record.lines}
+    blocks = state.stack.blocks
+    if due.keys() != blocks.keys() or any(end - begin not in due[key] for key, (begin, end) in blocks.items()):
+        raise StateError("inconsistent")
+
+
+def _read_record(fields: tuple[Any, ...], most: int) -> PairRecord:
+    base, known, lines, anew = fields
+    epochs = tuple(read_contact(epoch) for epoch in read_items(lines, most))
+    if list(epochs) != sorted(set(epochs)):
+        raise StateError("inconsistent")
+    return PairRecord(read_epoch(base), _flag(known), epochs, _flag(anew))
+
+
+def _read_split(settings: AgentSettings, t_ns: int, mean: Any, cov: Any, body: Any) -> SavedSplit:
+    raw_tracks, relayed, doubted, contacts = read_fields(body, 4)
+    followed, n = {}, settings.layout.dim
+    for item in _items(raw_tracks):
+        target, model, learnt = read_fields(item, 3)
+        n += _dim(settings, target, model)
+        followed[target] = _stamp(learnt)
+    if len(followed) != len(raw_tracks):
+        raise StateError("inconsistent")
+    P = _cov(cov, n)
+    state = JointState(
+        t_ns,
+        read_array(mean, n).copy(),
+        Split(np.zeros((n, n)), P),
+        tuple(followed),
+        tuple(followed.values()),
+        _targets(settings, relayed, lambda mean, cov, f: RelayedTrack(mean, cov, _stamp(f[0]), _flag(f[1]))),
+        _by_id(doubted, 1, lambda f: read_integer(f[0], 2**31)),
+    )
+    if followed.keys() & state.relayed.keys():
+        raise StateError("inconsistent")
+    return SavedSplit(state, _by_id(contacts, 1, lambda f: read_contact(f[0])), until_ns=t_ns)
+
+
+def _items(raw: Any) -> tuple[Any, ...]:
+    return read_items(raw, 64 * MAX_PEERS)
+
+
+def _by_id(raw: Any, count: int, read: Callable[[tuple[Any, ...]], Any], most: int = MAX_PEERS) -> dict[str, Any]:
+    """What is told of each robot or target by `count` fields."""
+    found = {}
+    for item in read_items(raw, most):
+        name, *fields = read_fields(item, count + 1)
+        if read_id(name) in found:
+            raise StateError("inconsistent")
+        found[name] = read(tuple(fields))
+    return found
+
+
+def _targets(settings: AgentSettings, raw: Any, read: Callable[..., Any]) -> dict[str, Any]:
+    """Beliefs of targets (id, model, mean, cov, and two fields more); `read` is given mean, cov and these fields."""
+    found = _by_id(raw, 5, lambda fields: fields, MAX_TRACKS)
+    for name, (model, mean, cov, *rest) in found.items():
+        dim = _dim(settings, name, model)
+        found[name] = read(read_array(mean, dim).copy(), _cov(cov, dim), rest)
+    return found
+
+
+def _dim(settings: AgentSettings, target: Any, model: Any) -> int:
+    """Components of a target's track. Raises `StateError` if the settings have no such target."""
+    motion = next((item.motion for item in settings.tracked if item.id == target), None)
+    if motion is None or motion.layout.name != read_text(model):
+        raise StateError("other_model")
+    return motion.layout.dim
+
+
+def _cov(raw: Any, n: int) -> Array:
+    P = read_array(raw, n * n).reshape(n, n).copy()
+    if np.abs(P - P.T).max() > ASYMMETRY * np.abs(P).max() or not is_positive_definite(P):
+        raise StateError("not_positive_definite")
+    return P
+
+
+def _stamp(raw: Any) -> int:
+    if type(raw) is not int:
+        raise StateError("wrong_type")
+    if abs(raw) > MAX_INT:
+        raise StateError("out_of_range")
     return raw
 
 
-def _estimate(told: Any) -> Estimate:
-    t_ns, model, mean, cov, raw_tracks = _fields(told, 5)
-    if type(t_ns) is not int or not 0 <= t_ns <= MAX_INT or type(raw_tracks) is not list:
-        raise StateError("malformed")
-    if len(raw_tracks) > MAX_TRACKS:
-        raise StateError("malformed")
-    tracks = []
-    for item in raw_tracks:
-        target, *belief = _fields(item, 4)
-        if type(target) is not str or not valid_id(target):
-            raise StateError("malformed")
-        tracks.append(TrackEstimate(target, *_checked(*belief)))
-    return Estimate(t_ns, *_checked(model, mean, cov), tuple(tracks))
-
-
-def _checked(model: Any, mean: Any, cov: Any) -> tuple[str, Array, Array]:
-    layout = STATES.get(model) if type(model) is str else None
-    if layout is None or type(mean) is not bytes or type(cov) is not bytes:
-        raise StateError("malformed")
-    n = layout.dim
-    if len(mean) != 8 * n or len(cov) != 8 * n * n:
-        raise StateError("malformed")
-    x, P = np.frombuffer(mean, "<f8").copy(), np.frombuffer(cov, "<f8").reshape(n, n).copy()
-    if not np.isfinite(x).all() or not is_positive_definite(P) or np.abs(P - P.T).max() > 1e-9 * np.abs(P).max():
-        raise StateError("malformed")
-    return layout.name, x, P
-
-
-def usable(settings: AgentSettings, estimate: Estimate, now_ns: int, max_age_ns: int, ahead_ns: int = 0) -> None:
-    """Raises `StateError` if a robot of these settings can't begin with an estimate: `other_model`, `too_old`,
-    `from_future`."""
-    if estimate.model != settings.layout.name:
-        raise StateError("other_model")
-    if estimate.t_ns > now_ns + ahead_ns:
-        raise StateError("from_future")
-    if now_ns - estimate.t_ns > max_age_ns:
-        raise StateError("too_old")
-
-
-def restarted(settings: AgentSettings, estimate: Estimate) -> AgentSettings:
-    """The settings of a robot that goes on with a saved estimate, by the rules above; other targets have no prior.
-
-    A `replica` starts as it is configured: what it knows follows from raw data, which it no longer has.
-    """
-    localization = settings.localization
-    if localization.kind == "replica":
-        return settings
-    tracks = {track.target: track for track in estimate.tracks}
-    factors = localization.form in ("safe", "published", "joint")
-    inflation = 2.0 if factors else 1.0
-    targets = []
-    for target in settings.targets:
-        track = tracks.get(target.id)
-        if track is not None and track.model == target.motion.layout.name:
-            targets.append(replace(target, mean=track.mean, cov=inflation * track.cov))
-        else:
-            targets.append(target if localization.form == "joint" else replace(target, mean=None))
-    return replace(
-        settings,
-        source="survey",
-        start_ns=estimate.t_ns,
-        mean=estimate.mean,
-        cov=inflation * estimate.cov,
-        shared=None if factors else estimate.cov,
-        found_out=True,
-        targets=tuple(targets),
-    )
+def _flag(raw: Any) -> bool:
+    if type(raw) is not bool:
+        raise StateError("wrong_type")
+    return raw

@@ -117,6 +117,7 @@ class AgentSettings:
                      and cov only what neither tells, the gains of an odometry, counts then
     shared           the part (n, n) of cov that stems from errors which peers may hold too; None: nothing of it
     found_out        the robot has found out where it is, and starts later than the others
+    persist_ns       what is known is kept for the next start so often, at most
     track_within_m   how far off a target can be that is seen by a bearing or a range alone; None: such a sighting
                      starts no track
     """
@@ -139,6 +140,7 @@ class AgentSettings:
     source: Literal["survey", "fix", "peer"] = "survey"
     shared: Array | None = None
     found_out: bool = False
+    persist_ns: int = NS
 
     @property
     def layout(self) -> StateLayout:

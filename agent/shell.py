@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import logging
 import os
 import secrets
@@ -33,10 +34,9 @@ from agent.lateness_figures import LatenessFigures
 from agent.mavlink import MavlinkError, MavlinkLink
 from agent.node import Node, Outgoing, rejected
 from agent.recording import RecordingWriter
-from agent.saved_state import StateError, restarted, usable
-from agent.settings import AgentSettings, nanoseconds
-from agent.state_file import Found, StateFile
-from agent.state_keeper import StateKeeper
+from agent.settings import nanoseconds
+from agent.state_file import StateFile
+from agent.state_keeper import Start, StateKeeper, start
 from network.messages import Channel, Packet
 from network.zenoh_transport import ZenohSettings, ZenohTransport
 
@@ -81,8 +81,7 @@ class AgentShell:
         self._lags = LatenessFigures()
         self._stop = asyncio.Event()
         self.counters: Counter[str] = Counter()
-        self._state = StateFile(self._state_dir, self.robot, config.state.sync)
-        self._found = Found(1)
+        self._file = StateFile(self._state_dir, self.robot, config.state.sync)
         self._keeper: StateKeeper | None = None
 
     async def run(self) -> None:
@@ -110,12 +109,11 @@ class AgentShell:
             await self._control.connect(config.control_socket)
         try:
             self._state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self._found = self._state.begin(time.time_ns(), config.identity.incarnation)
+            self._found = self._file.read()
+            if not os.access(self._state_dir, os.W_OK):
+                raise PermissionError(errno.EACCES, "permission denied")
         except OSError as error:
             raise ConfigError(f"state_dir {self._state_dir} cannot be written: {error.strerror}") from None
-        if self._found.refused is not None:
-            self.counters[f"state.{self._found.refused}"] += 1
-            log.warning("the state file is refused: %s; it is kept as state.refused", self._found.refused)
         if config.zenoh.insecure_lan:
             log.warning("zenoh.insecure_lan: messages to peers are neither encrypted nor authenticated")
         self._boot_id = secrets.randbits(53)
@@ -196,20 +194,21 @@ class AgentShell:
         config = self.config
         start_ns = self._clock.t0_ns if config.clock.source == "run" else self._clock.now_ns()
         self._start_ns = start_ns
+        begin = self._restored(start_ns)
         if config.recording is not None:
             self._recording = RecordingWriter(Path(config.recording))
             self._recording.add_robot(config, start_ns)
-        settings = self._settings(start_ns)
-        if self._recording is not None and settings.found_out:
-            self._recording.begin_life(self.robot, self._clock.now_ns(), self._found.estimate)
+            if begin.again or begin.state is not None:
+                self._recording.begin_life(self.robot, start_ns, begin.state)
         self._node = Node(
-            settings,
+            begin.settings,
             config.network.settings(config.lateness),
             boot_id=self._boot_id,
-            incarnation=self._found.incarnation,
+            incarnation=begin.incarnation,
             software=SOFTWARE,
             sensors=config.sensor_configs(),
             recorder=self._record if self._recording is not None else None,
+            state=begin.state,
         )
         if config.mavlink is not None:
             self._reader = AutopilotReader(config.mavlink.settings(list(config.origin)))
@@ -218,21 +217,27 @@ class AgentShell:
             await self._reached(config.mavlink.endpoint)
         self._arm()
 
-    def _settings(self, start_ns: int) -> AgentSettings:
-        """Those of the file; after a restart, with what the robot last knew of itself."""
-        settings, found = self.config.settings(start_ns), self._found.estimate
-        self._keeper = StateKeeper(self._state, nanoseconds(self.config.state.interval_s), self.counters)
-        if found is None:
-            return settings
-        try:
-            # A run's clock starts a little after the barrier, and before that nothing is late or early.
-            usable(settings, found, max(self._clock.now_ns(), start_ns), nanoseconds(self.config.state.max_age_s))
-        except StateError as error:
-            self.counters[f"state.{error.reason}"] += 1
-            log.warning("the saved estimate is not used: %s", error.reason)
-            return settings
-        self.counters["state.used"] += 1
-        return restarted(settings, found)
+    def _restored(self, start_ns: int) -> Start:
+        """How to begin, with the state file if it can be used; the life has begun on disk when this returns."""
+        config, found = self.config, self._found
+        run_ns = start_ns if config.clock.source == "run" else None
+        max_age_ns = nanoseconds(config.state.max_age_s)
+        # A run's clock starts a little after the barrier.
+        now_ns = max(self._clock.now_ns(), start_ns)
+        settings, first = config.settings(start_ns), config.identity.incarnation
+        begin, reason = start(found, settings, now_ns, max_age_ns, run_ns, time.time_ns(), first)
+        if reason is not None:
+            self._file.refuse()
+        reason = reason or found.refused
+        if reason is not None:
+            self.counters[f"state.refused_{reason}"] += 1
+            log.warning("the saved state is not used: %s; it is kept as state.bad", reason)
+        self._keeper = StateKeeper(self._file, begin.incarnation, self.counters)
+        if begin.state is not None:
+            self.counters["state.used"] += 1
+        elif not self._keeper.begin():
+            log.warning("the state file cannot be written: the next start will not know of this one")
+        return begin
 
     async def _reached(self, endpoint: str) -> None:
         """A stream must be there at the start, for a wrong address must not go unnoticed; later it is redialled."""
@@ -287,14 +292,16 @@ class AgentShell:
         self._carry_out(self._node.on_tick(now_ns))
 
     def _carry_out(self, out: Outgoing) -> None:
-        assert self._transport is not None
+        assert self._transport is not None and self._keeper is not None
+        safe = out.persist is None or self._keeper.keep(out.persist)
         for packet in out.packets:
-            self._transport.send(packet)
-        for alarm in out.alarms:
+            if safe or packet.channel != Channel.PAIR:
+                self._transport.send(packet)
+            else:
+                self.counters["state.held_back"] += 1
+        for alarm in (*out.alarms, *self._keeper.alarms()):
             self._warn(alarm)
         if out.estimates:
-            assert self._keeper is not None
-            self._keeper.published(out.estimates[-1])
             wall = time.monotonic()
             if wall - self._published_s >= PUBLISH_INTERVAL_S:
                 self._published_s = wall
@@ -367,6 +374,7 @@ class AgentShell:
         if self._timer is not None:
             self._timer.cancel()
         figures = self._figures() if self._node is not None else None
+        state = self._node.agent.saved() if self._node is not None else None
         self._node = None
         self._receive = _ignore
         if self._mavlink is not None:
@@ -377,7 +385,7 @@ class AgentShell:
         if self._recording is not None:
             self._recording.close()
         if self._keeper is not None:
-            await self._keeper.close()
+            await self._keeper.close(state)
         if self._control is not None:
             if figures is not None:
                 self._control.say({"done": figures})

@@ -28,6 +28,7 @@ from agent.joint_history import JointHistory, Learnt
 from agent.joint_state import CONTRADICTIONS, JointModel, Used
 from agent.joint_tracks import JointState
 from agent.pair_clock import PairClocks
+from agent.saved_state import SavedSplit
 from agent.settings import AgentSettings
 from agent.split_exchange import SplitExchange
 from network.messages import (
@@ -55,24 +56,27 @@ LONGEST = Epoch(2**62, "r" * 24, 2**53)
 class SplitFilter:
     """The form `split_joint`; see `agent.cooperative_filter` for what each method is given."""
 
+    keeps_factors = False
+
     def __init__(
         self,
         settings: AgentSettings,
         counters: Counter[str],
         count_nis: Callable[[str, float], None],
-        start: JointState | None = None,
+        saved: SavedSplit | None = None,
     ) -> None:
-        """`start`: the first state, by default that of the settings."""
+        """`saved`: what to begin with, instead of what the settings say."""
         self._settings, self._counters, self._count_nis = settings, counters, count_nis
         self._model = JointModel(settings)
-        first = start or self._model.tracks.initial()
+        first = self._model.tracks.initial() if saved is None else saved.state
+        self._known_ns = None if saved is None else saved.until_ns
         self.history = JointHistory(self._model, settings.lateness, first, counters)
         self._motions = {target.id: target.motion for target in settings.targets}
         self._clocks = PairClocks(settings)
         self._exchanges: dict[str, SplitExchange] = {}
         self._waiting: dict[str, SplitExchange] = {}
         self._lives: dict[str, tuple[int, int]] = {}
-        self._contacts: dict[str, Epoch] = {}
+        self._contacts: dict[str, Epoch] = {} if saved is None else dict(saved.contacts)
         self._told_of: tuple[JointState | None, Estimate] = None, Estimate(0, "", settings.mean, settings.cov)
 
     @property
@@ -118,9 +122,8 @@ class SplitFilter:
     def contacts(self) -> dict[str, Epoch]:
         return dict(self._contacts)
 
-    def take_over(self, contacts: dict[str, Epoch]) -> None:
-        """Count the contacts another form has used, by peer, as the last ones."""
-        self._contacts.update(contacts)
+    def saved(self) -> SavedSplit:
+        return SavedSplit(_shared(self.state), dict(self._contacts))
 
     def form(self) -> tuple[str, str]:
         return "split_joint", "configured"
@@ -274,7 +277,8 @@ class SplitFilter:
             if reply is not None:
                 effects.append(Send(peer, epoch.t_meas_ns, reply))
             return
-        then = self.history.at(t_ns)
+        known = self._known_ns is not None and t_ns <= self._known_ns + self._settings.lateness.tolerance_ns
+        then = None if known else self.history.at(t_ns)
         if then is None:
             self._counters["pair.too_old"] += 1
             exchange.answered(epoch, None)

@@ -1,29 +1,84 @@
-"""The file a robot keeps across starts: written whole or not at all, and refused with the reason if it is not whole."""
+"""The file a robot keeps across starts: written whole or not at all, and refused with the reason if it cannot be used.
+
+It holds the robot's incarnation, which names its lives in ascending order, and the newest state of its core. A usable
+state is begun with under the same incarnation; peers know by that that nothing they rely on is lost. Without one a new
+life begins, and its number is on disk before it is used.
+"""
 
 from __future__ import annotations
 
-import logging
 import os
 from dataclasses import dataclass
+from hashlib import blake2b
 from pathlib import Path
+from typing import Any
 
-from agent.effects import Estimate
-from agent.saved_state import MAX_BYTES, MAX_INCARNATION, StateError, decode, encode
+import msgpack
 
-log = logging.getLogger("cofix.agent")
+from agent.saved_state import MAX_BYTES, StateError
+from network.wire_fields import valid_id
 
 FILE = "state.bin"
-REFUSED = "state.refused"
+REFUSED = "state.bad"
 MODE = 0o600
+MAGIC = b"cofix state "
+VERSION = b"1\n"
+LENGTH_BYTES = 4
+DIGEST_BYTES = 16
+MAX_INCARNATION = 2**53
+
+_LENGTH = len(MAGIC) + len(VERSION)
+_DIGEST = _LENGTH + LENGTH_BYTES
+_HEAD = _DIGEST + DIGEST_BYTES
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What a start finds: the number of the life that begins, the last estimate, and why a file was refused."""
+    """What a start finds: the number of the last life, its state if there is one, and why a file is refused."""
 
-    incarnation: int
-    estimate: Estimate | None = None
+    incarnation: int | None = None
+    state: bytes | None = None
     refused: str | None = None
+
+
+def pack(robot: str, incarnation: int, state: bytes | None) -> bytes:
+    """The bytes of a file: what it is, the length and checksum of its body, and the body."""
+    body: bytes = msgpack.packb([robot, incarnation, state])
+    length = len(body).to_bytes(LENGTH_BYTES, "little")
+    return MAGIC + VERSION + length + blake2b(body, digest_size=DIGEST_BYTES).digest() + body
+
+
+def unpack(payload: bytes, robot: str) -> tuple[int, bytes | None]:
+    """(incarnation, state) of a file of `robot`. Raises `StateError`."""
+    if len(payload) < _HEAD:
+        raise StateError("torn")
+    if len(payload) > MAX_BYTES + _HEAD:
+        raise StateError("oversize")
+    if not payload.startswith(MAGIC):
+        raise StateError("corrupt")
+    if not payload.startswith(MAGIC + VERSION):
+        raise StateError("other_version")
+    body = payload[_HEAD:]
+    if len(body) < int.from_bytes(payload[_LENGTH:_DIGEST], "little"):
+        raise StateError("torn")
+    if blake2b(body, digest_size=DIGEST_BYTES).digest() != payload[_DIGEST:_HEAD]:
+        raise StateError("corrupt")
+    if len(body) != int.from_bytes(payload[_LENGTH:_DIGEST], "little"):
+        raise StateError("corrupt")
+    try:
+        raw: Any = msgpack.unpackb(body, use_list=False, max_map_len=0, max_ext_len=0)
+    except (ValueError, TypeError, RecursionError, msgpack.UnpackException):
+        raise StateError("malformed") from None
+    if type(raw) is not tuple or len(raw) != 3:
+        raise StateError("malformed")
+    name, incarnation, state = raw
+    if type(name) is not str or not valid_id(name) or type(incarnation) is not int:
+        raise StateError("malformed")
+    if not 1 <= incarnation < MAX_INCARNATION or type(state) not in (bytes, type(None)):
+        raise StateError("malformed")
+    if name != robot:
+        raise StateError("other_robot")
+    return incarnation, state
 
 
 class StateFile:
@@ -31,40 +86,50 @@ class StateFile:
 
     def __init__(self, state_dir: Path, robot: str, sync: bool = True) -> None:
         self._path, self._robot, self._sync = state_dir / FILE, robot, sync
-        self._incarnation = 0
+        self._refused = state_dir / REFUSED
 
-    def begin(self, now_ns: int, first: int | None = None) -> Found:
-        """Begin a life, and write down that it has begun. Raises OSError if that cannot be written.
-
-        Its number is one more than the last one. Without a usable file (first start, or a disk that was lost) it is
-        `first`, or comes from the clock in seconds, which is later than any number counted up from an earlier start.
-        A file that cannot be used is kept aside as `state.refused`.
-        """
-        estimate, refused, last = None, None, 0
+    def read(self) -> Found:
+        """What the last life has left. A file that cannot be used is kept aside as `state.bad`, one of them."""
+        payload, reason = None, None
         try:
-            payload = self._read()
-            if payload is not None:
-                last, estimate = decode(payload, self._robot)
-        except StateError as error:
-            refused = error.reason
-            self._path.replace(self._path.with_name(REFUSED))
-        number = last + 1 if last else first or min(max(1, now_ns // 1_000_000_000), MAX_INCARNATION - 1)
-        self._incarnation = number
-        self.write(estimate)
-        return Found(number, estimate, refused)
-
-    def _read(self) -> bytes | None:
+            payload = self._bytes(self._path)
+        except OSError:
+            reason = "unreadable"
+        if payload is not None:
+            try:
+                return Found(*unpack(payload, self._robot))
+            except StateError as error:
+                reason = error.reason
+        if reason is not None:
+            self.refuse()
+        # What was put aside still tells how many lives there have been.
         try:
-            with self._path.open("rb") as file:
-                return file.read(MAX_BYTES + 1)
+            aside = self._bytes(self._refused)
+            return Found(None if aside is None else unpack(aside, self._robot)[0], None, reason)
+        except (OSError, StateError):
+            return Found(None, None, reason)
+
+    def _bytes(self, path: Path) -> bytes | None:
+        try:
+            with path.open("rb") as file:
+                return file.read(MAX_BYTES + _HEAD + 1)
         except FileNotFoundError:
             return None
-        except OSError:
-            raise StateError("unreadable") from None
 
-    def write(self, estimate: Estimate | None) -> None:
+    def refuse(self) -> bool:
+        """Put the file aside, so that no start begins with it; needs no space. False if it is still there."""
+        try:
+            self._path.replace(self._refused)
+            self._sync_folder()
+        except FileNotFoundError:
+            return True
+        except OSError:
+            return False
+        return True
+
+    def write(self, incarnation: int, state: bytes | None) -> None:
         """Replace the file. Raises OSError; the old one is there still then."""
-        payload = encode(self._robot, self._incarnation, estimate)
+        payload = pack(self._robot, incarnation, state)
         temporary = self._path.with_suffix(".tmp")
         handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, MODE)
         try:
@@ -76,9 +141,22 @@ class StateFile:
         finally:
             os.close(handle)
         temporary.replace(self._path)
-        if self._sync:
-            folder = os.open(self._path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+        self._sync_folder()
+
+    def _sync_folder(self) -> None:
+        if not self._sync:
+            return
+        folder = os.open(self._path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def next_incarnation(last: int | None, now_ns: int) -> int:
+    """The number of a new life: one more than the last one.
+
+    Where that is lost (first start, or a lost disk) it comes from the clock in seconds, which is later than any number
+    counted up from an earlier start.
+    """
+    return last + 1 if last is not None else min(max(1, now_ns // 1_000_000_000), MAX_INCARNATION - 1)

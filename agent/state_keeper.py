@@ -1,54 +1,124 @@
-"""Writes a robot's state file from time to time, beside the event loop, and never more than one at a time."""
+"""What a start does with the state file, and when a running robot writes it.
+
+If the state that a message of a contact relies on cannot be written (a full disk), the file is put aside, which needs
+no space, and the message goes out: a start that finds no state begins a new life, its peers begin anew with it, and
+that is sound. If not even that is possible (a disk that is read-only by now), a later start would begin with a state
+that knows less than its peers: then the messages of contacts are held back, as if they had been lost. Own data and
+contacts are used all the same, and nothing stops. Forms without factors rely on nothing; their file stays as it is.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import threading
 from collections import Counter
+from dataclasses import dataclass
 
-from agent.effects import Estimate
-from agent.state_file import StateFile
+from agent.effects import Alarm, Persist
+from agent.saved_state import StateError, begun_again, decode
+from agent.settings import NS, AgentSettings
+from agent.state_file import Found, StateFile, next_incarnation
 
 log = logging.getLogger("cofix.agent")
 
 
-class StateKeeper:
-    """Keeps the newest estimate on disk, at most every `interval_ns` of fleet time.
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """How a robot begins: its settings, its incarnation, and the state it goes on with, if there is one.
 
-    A disk that is full or gone is counted as `state.write_failed`, said once until it is better, and stops nothing.
+    `again`: it has lived before, and its settings are those of `agent.saved_state.begun_again`.
     """
 
-    def __init__(self, file: StateFile, interval_ns: int, counters: Counter[str]) -> None:
-        self._file, self._interval_ns, self._counters = file, interval_ns, counters
-        self._newest: Estimate | None = None
-        self._written: Estimate | None = None
+    settings: AgentSettings
+    incarnation: int
+    state: bytes | None = None
+    again: bool = False
+
+
+def start(
+    found: Found,
+    settings: AgentSettings,
+    now_ns: int,
+    max_age_ns: int,
+    run_ns: int | None,
+    wall_ns: int,
+    first: int | None = None,
+) -> tuple[Start, str | None]:
+    """How to begin with what was found, and why its state is not used, if it is not.
+
+    now_ns    fleet time; run_ns: when the run began, if the fleet's clock is that of a run
+    wall_ns   time of day, for the number of a life that nothing is known of before, unless that is `first`
+    """
+    reason = None
+    if found.incarnation is not None and found.state is not None:
+        try:
+            decode(found.state, settings).check_age(now_ns, max_age_ns, run_ns)
+            return Start(settings, found.incarnation, found.state), None
+        except StateError as error:
+            reason = error.reason
+    # The survey of a run is of its start: who begins later has lived before, or has stood where nobody knows.
+    late = run_ns is not None and now_ns - run_ns > max(settings.lateness.horizon_ns, NS)
+    lived = run_ns is not None and (found.incarnation is not None or found.refused is not None)
+    again = late or lived
+    lost = again or found.incarnation is not None or found.refused is not None
+    given = first is not None and found.incarnation is None and (first > 1 or not lost)
+    incarnation = first if given and first is not None else next_incarnation(found.incarnation, wall_ns)
+    return Start(begun_again(settings) if again else settings, incarnation, None, again), reason
+
+
+class StateKeeper:
+    """Writes the states of one life. Writes that nothing waits for are done beside the event loop, one at a time."""
+
+    def __init__(self, file: StateFile, incarnation: int, counters: Counter[str]) -> None:
+        self._file, self._incarnation, self._counters = file, incarnation, counters
+        self._lock = threading.Lock()
+        self._number = self._written = 0
+        self._waiting: tuple[int, bytes] | None = None
         self._task: asyncio.Task[None] | None = None
-        self._failing = False
+        self._failure: str | None = None
 
-    def published(self, estimate: Estimate) -> None:
-        """A new estimate."""
-        self._newest = estimate
-        if self._task is not None and not self._task.done():
-            return
-        if self._written is None or estimate.t_ns - self._written.t_ns >= self._interval_ns:
-            self._written = estimate
-            self._task = asyncio.get_running_loop().create_task(asyncio.to_thread(self._write, estimate))
+    def keep(self, persist: Persist) -> bool:
+        """Write a state; False if packets that go with it must not be sent."""
+        self._number += 1
+        if persist.ahead:
+            return self._write(self._number, persist.payload) or self._file.refuse()
+        self._waiting = self._number, persist.payload
+        if self._task is None or self._task.done():
+            self._task = asyncio.get_running_loop().create_task(self._write_waiting())
+        return True
 
-    async def close(self) -> None:
-        """Write the newest estimate down."""
+    async def _write_waiting(self) -> None:
+        while self._waiting is not None:
+            (number, payload), self._waiting = self._waiting, None
+            await asyncio.to_thread(self._write, number, payload)
+
+    def begin(self) -> bool:
+        """Write down that this life has begun."""
+        return self._write(0, None)
+
+    def _write(self, number: int, payload: bytes | None) -> bool:
+        with self._lock:
+            if number < self._written:
+                return True
+            try:
+                self._file.write(self._incarnation, payload)
+            except OSError as error:
+                self._failure = error.strerror or type(error).__name__
+                self._counters["state.write_failed"] += 1
+                return False
+            self._written, self._failure = number, None
+            self._counters["state.written"] += 1
+            return True
+
+    def alarms(self) -> list[Alarm]:
+        """What a person should know, as long as it is so."""
+        return [] if self._failure is None else [Alarm("state.write_failed", self._failure)]
+
+    async def close(self, state: bytes | None) -> None:
+        """Write the last state down at a clean end."""
         if self._task is not None:
             await self._task
-        if self._newest is not None and self._newest is not self._written:
-            self._write(self._newest)
-
-    def _write(self, estimate: Estimate) -> None:
-        try:
-            self._file.write(estimate)
-        except OSError as error:
-            self._counters["state.write_failed"] += 1
-            if not self._failing:
-                log.warning("the state file cannot be written (%s): a restart would begin without it", error.strerror)
-            self._failing = True
-            return
-        self._failing = False
-        self._counters["state.written"] += 1
+        if state is not None:
+            self._number += 1
+            self._write(self._number, state)

@@ -13,6 +13,7 @@ from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, Relativ
 from agent.estimation.track_start import DETERMINING
 from agent.events import LinkChange, Observation, Received
 from agent.pair_clock import PairClocks
+from agent.saved_state import Saved
 from agent.settings import AgentSettings
 from agent.start import StartEvidence, Told
 from network.messages import (
@@ -38,6 +39,8 @@ FAR_FUTURE_NS = 2**62
 
 class WaitingFilter:
     """Before the start; see `agent.cooperative_filter` for what each method is given."""
+
+    keeps_factors = False
 
     def __init__(self, settings: AgentSettings, counters: Counter[str]) -> None:
         self._settings, self._counters = settings, counters
@@ -167,6 +170,9 @@ class WaitingFilter:
 
     def form(self) -> tuple[str, str]:
         return self._settings.localization.form, "waiting for a start"
+
+    def saved(self) -> Saved | None:
+        return None
 
 
 def _told(snapshot: Snapshot | SplitSnapshot | JointSnapshot) -> Told | None:

@@ -273,8 +273,8 @@ class VirtualEngine:
         """What a robot makes of an event."""
         if self._checker is not None:
             self._checker.after(node, self._now, event, out)
-        if out.estimates:
-            self._processes[node.robot].save(out.estimates[-1])
+        if out.persist is not None:
+            self._processes[node.robot].keep(out.persist)
         for packet in out.packets:
             self._transmit(packet)
         self._arm(node.robot)

@@ -11,15 +11,16 @@ from typing import Any
 from agent.clock_faults import FaultyClock
 from agent.config import AgentConfig
 from agent.core import NisSum
-from agent.effects import Estimate
+from agent.effects import Persist
 from agent.node import Node, Recorder, rejected
-from agent.saved_state import StateError, restarted, usable
 from agent.settings import nanoseconds
+from agent.state_file import Found
+from agent.state_keeper import start
 
 SOFTWARE = "cofix-0.1.0"
 
-LifeSink = Callable[[str, int, Estimate | None], None]
-"""(robot, own time, the estimate it had saved) of every start after the first."""
+LifeSink = Callable[[str, int, bytes | None], None]
+"""(robot, own time, the state it begins with) of every start after the first."""
 
 MAX_KEPT = 64
 """Packets, and sensor data, that wait for a process that is paused: its sockets keep no more."""
@@ -47,10 +48,8 @@ class Process:
     ) -> None:
         self.robot, self.clock = robot, clock
         self._config, self._seed, self._recorder, self._life_sink = config, seed, recorder, life_sink
-        self._saved: Estimate | None = None
-        self._interval_ns = nanoseconds(config.state.interval_s)
         self._lives = 0
-        self._incarnation = 0
+        self._file = Found()
         self._past: list[Node] = []
         self._waiting: Waiting | None = None
         self.node: Node | None = None
@@ -62,42 +61,39 @@ class Process:
         """Begin a life at `t_ns`, as a process does that is started with the same configuration again."""
         if self.node is not None:
             return
-        settings, now_ns = self._config.settings(0), self.clock.local_ns(t_ns)
         if not keep_state:
-            self._saved = None
-        saved = self._saved
-        if saved is not None:
-            try:
-                usable(settings, saved, now_ns, nanoseconds(self._config.state.max_age_s))
-                settings = restarted(settings, saved)
-            except StateError:
-                saved = None
+            self._file = Found(self._file.incarnation)
+        now_ns, max_age_ns = self.clock.local_ns(t_ns), nanoseconds(self._config.state.max_age_s)
+        begin, refused = start(self._file, self._config.settings(0), now_ns, max_age_ns, 0, 0, 1)
+        self._file = Found(begin.incarnation, begin.state)
         if self._lives and self._life_sink is not None:
-            self._life_sink(self.robot, now_ns, saved)
-        self._incarnation += 1
+            self._life_sink(self.robot, now_ns, begin.state)
         self._lives += 1
         name = f"{self._seed}/{self.robot}" + (f"/{self._lives}" if self._lives > 1 else "")
         boot = hashlib.blake2b(name.encode(), digest_size=7).digest()
         self.node = Node(
-            settings,
+            begin.settings,
             self._config.network.settings(self._config.lateness),
             boot_id=int.from_bytes(boot, "little"),
-            incarnation=self._incarnation,
+            incarnation=begin.incarnation,
             software=SOFTWARE,
             sensors=self._config.sensor_configs(),
             recorder=self._recorder,
+            state=begin.state,
         )
+        if refused is not None:
+            self.node.counters[f"state.refused_{refused}"] += 1
 
-    def save(self, estimate: Estimate) -> None:
-        """An estimate was published: it goes to the state file if that is due."""
-        if self._saved is None or estimate.t_ns - self._saved.t_ns >= self._interval_ns:
-            self._saved = estimate
+    def keep(self, persist: Persist) -> None:
+        """Write the state file."""
+        self._file = Found(self._file.incarnation, persist.payload)
 
     def stop(self, in_order: bool = False) -> None:
         """End the life: all that was in memory is gone, unless it ends in good order."""
         if self.node is not None:
-            if in_order:
-                self._saved = self.node.agent.estimate() or self._saved
+            state = self.node.agent.saved() if in_order else None
+            if state is not None:
+                self._file = Found(self._file.incarnation, state)
             self._past.append(self.node)
         self.node = self._waiting = None
 

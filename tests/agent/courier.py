@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.core import Agent
-from agent.effects import Effect, Send
+from agent.effects import Effect, Persist, Send
 from agent.estimation.colocalization import resolve_cross
 from agent.estimation.gaussian import gain
 from agent.estimation.motion import UNICYCLE
@@ -70,6 +70,8 @@ class Pair:
         self.agents = {name: Agent(settings(name, *start, **options)) for name, start in starts.items()}
         self.now_ns = 0
         self.lives = {FIRST: 1, SECOND: 1}
+        self.files: dict[str, bytes] = {}
+        """What each robot had kept last."""
         self._seq = 0
 
     def odometry(self, robot: str, t0_ns: int, t_ns: int, delta: Array, cov: Array) -> list[Letter]:
@@ -100,6 +102,9 @@ class Pair:
         self.agents[to].handle(LinkChange(self.now_ns, about, True, life, life))
 
     def _letters(self, robot: str, effects: list[Effect]) -> list[Letter]:
+        for effect in effects:
+            if isinstance(effect, Persist):
+                self.files[robot] = effect.payload
         return [Letter(robot, item.peer, item.t_meas_ns, item.body, self.lives[robot]) for item in sends(effects)]
 
     def cross(self) -> Array | None:
@@ -141,8 +146,12 @@ class Ledger:
 
     def mark(self, t_ns: int) -> None:
         """Remember both errors at an instant a contact will refer to."""
-        for name, rows in self.error.items():
-            self._at[name, t_ns] = rows.copy()
+        for name in self.error:
+            self.mark_one(name, t_ns)
+
+    def mark_one(self, robot: str, t_ns: int) -> None:
+        """Remember the error of one robot."""
+        self._at[robot, t_ns] = self.error[robot].copy()
 
     def at(self, robot: str, t_ns: int) -> Array:
         """The error at a marked instant, over the noises known now."""

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from agent.core import Agent
-from agent.effects import Alarm, Effect, Publish, Send
+from agent.effects import Alarm, Effect, Persist, Publish, Send
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import CONSTANT_VELOCITY, TargetMotion
 from agent.events import Event, Fix, Observation, Odometry, Received, Tick
@@ -126,7 +126,8 @@ def test_the_first_fixes_start_it(form: str) -> None:
     subject.handle(still(NS))
     subject.handle(compass("r2", NS))
     effects = subject.handle(Fix(NS, NS, "position", TRUTH["r2"][:2], 0.04 * np.eye(2), "gps"))
-    assert isinstance(effects[0], Publish) and effects[1:] == [Alarm("started")]
+    assert isinstance(effects[0], Publish) and effects[1] == Alarm("started")
+    assert [type(effect) for effect in effects[2:]] == [Persist]
     assert np.abs(error(subject)).max() < 1e-6
     assert subject.status()["state"] == "running"
     before = subject.estimate()
