@@ -219,24 +219,14 @@ class AgentShell:
 
     def _restored(self, start_ns: int) -> Start:
         """How to begin, with the state file if it can be used; the life has begun on disk when this returns."""
-        config, found = self.config, self._found
+        config = self.config
         run_ns = start_ns if config.clock.source == "run" else None
-        max_age_ns = nanoseconds(config.state.max_age_s)
         # A run's clock starts a little after the barrier.
-        now_ns = max(self._clock.now_ns(), start_ns)
+        now_ns, max_age_ns = max(self._clock.now_ns(), start_ns), nanoseconds(config.state.max_age_s)
         settings, first = config.settings(start_ns), config.identity.incarnation
-        begin, reason = start(found, settings, now_ns, max_age_ns, run_ns, time.time_ns(), first)
-        if reason is not None:
-            self._file.refuse()
-        reason = reason or found.refused
-        if reason is not None:
-            self.counters[f"state.refused_{reason}"] += 1
-            log.warning("the saved state is not used: %s; it is kept as state.bad", reason)
+        begin, reason = start(self._found, settings, now_ns, max_age_ns, run_ns, time.time_ns(), first)
         self._keeper = StateKeeper(self._file, begin.incarnation, self.counters)
-        if begin.state is not None:
-            self.counters["state.used"] += 1
-        elif not self._keeper.begin():
-            log.warning("the state file cannot be written: the next start will not know of this one")
+        self._keeper.begin(begin, reason, self._found.refused)
         return begin
 
     async def _reached(self, endpoint: str) -> None:

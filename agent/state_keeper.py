@@ -93,21 +93,32 @@ class StateKeeper:
             (number, payload), self._waiting = self._waiting, None
             await asyncio.to_thread(self._write, number, payload)
 
-    def begin(self) -> bool:
-        """Write down that this life has begun."""
-        return self._write(0, None)
+    def begin(self, begin: Start, unused: str | None, refused: str | None) -> None:
+        """Write down that this life has begun; `unused`: why a state was not used, `refused`: why a file was not."""
+        if unused is not None:
+            self._file.refuse()
+        reason = unused or refused
+        if reason is not None:
+            self._counters[f"state.refused_{reason}"] += 1
+            log.warning("the saved state is not used: %s; it is kept as state.bad", reason)
+        if begin.state is not None:
+            self._counters["state.used"] += 1
+        elif not self._write(0, None):
+            log.warning("the state file cannot be written: the next start will not know of this one")
 
     def _write(self, number: int, payload: bytes | None) -> bool:
         with self._lock:
             if number < self._written:
                 return True
+            # Whatever becomes of it: no older state is written after it.
+            self._written = number
             try:
                 self._file.write(self._incarnation, payload)
             except OSError as error:
                 self._failure = error.strerror or type(error).__name__
                 self._counters["state.write_failed"] += 1
                 return False
-            self._written, self._failure = number, None
+            self._failure = None
             self._counters["state.written"] += 1
             return True
 

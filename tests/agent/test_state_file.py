@@ -159,6 +159,21 @@ def test_states_beside_the_loop_do_not_undo_newer_ones(tmp_path: Path) -> None:
     assert StateFile(tmp_path, "r1").read() == Found(7, b"last")
 
 
+def test_no_older_state_follows_one_that_could_not_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def story() -> None:
+        keeper = StateKeeper(StateFile(tmp_path, "r1"), 7, Counter())
+        keeper.keep(Persist(b"old"))
+        with monkeypatch.context() as broken:
+            broken.setattr(os, "write", lambda handle, data: (_ for _ in ()).throw(OSError(errno.ENOSPC, "full")))
+            assert keeper.keep(Persist(b"told", ahead=True))
+        await keeper.close(None)
+
+    asyncio.run(story())
+    assert StateFile(tmp_path, "r1").read().state is None
+
+
 def test_every_new_life_has_a_later_number() -> None:
     assert next_incarnation(None, NOW) == NOW // 1_000_000_000
     assert next_incarnation(7, NOW) == 8
