@@ -224,18 +224,25 @@ def replay(path: Path, robot: str) -> tuple[int, int, int | None]:
     config, start_ns = agents[robot]
     agent = Agent(config.settings(start_ns))
     events = effects = 0
+    cut: int | None = None
     for what in read_lives(path, robot):
         if isinstance(what, Life):
+            # A life that was killed may end before the effects of its last event are written.
+            cut = None
             settings = config.settings(start_ns)
             agent = Agent(settings if what.state is not None else begun_again(settings), what.state)
             continue
+        if cut is not None:
+            return cut, effects, cut
         event, recorded = what
         made = [pack(effect) for effect in _recorded(agent.handle(event))]
         if made != recorded:
-            return events, effects, events
+            if made[: len(recorded)] != recorded:
+                return events, effects, events
+            cut = events
         events += 1
-        effects += len(made)
-    return events, effects, None
+        effects += len(recorded)
+    return (events, effects, None) if cut is None else (cut, effects, cut)
 
 
 def merge(paths: dict[str, list[Path]], target: Path) -> None:
