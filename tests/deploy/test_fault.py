@@ -217,12 +217,12 @@ def test_a_run_that_goes_on_is_broken_and_healed_by_hand(tmp_path: Path) -> None
         return done.stdout.partition(":")[0]
 
     run = subprocess.Popen(
-        [*COFIX, "run", str(tmp_path / "trio.toml"), "--runtime", "processes", "--speed", "4", "--json"]
-        + ["--seed", "3", "--out", str(out)],
+        [*COFIX, "run", "trio.toml", "--runtime", "processes", "--speed", "4", "--json", "--seed", "3", "--out", "run"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         env=environment,
+        cwd=tmp_path,
     )
     try:
         deadline = time.monotonic() + 60.0
