@@ -1,7 +1,11 @@
 """The line between a process of a run and its launcher: JSON lines over a local Unix socket.
 
     process -> launcher   {"hello": id}, {"ready": id}, {"status": {...}}, {"done": {...}}, {"failed": "why"}
-    launcher -> process   {"start": {"t0_ns": ..., "monotonic0_ns": ...}}, {"stop": true}
+    launcher -> process   {"start": {"t0_ns": ..., "monotonic0_ns": ..., "changes": [...]}}, {"stop": true},
+                          {"fault": {table of [[faults]]}}, {"end_fault": {"id": ..., "at_s": ...}}
+
+`changes` are the messages about faults so far, for a process that starts while the run goes on; times of faults count
+from the start of the run.
 
 The end of the stream counts as a stop: no process outlives its launcher.
 """
@@ -21,7 +25,9 @@ class ControlLine:
         self._name = name
         self._writer: asyncio.StreamWriter | None = None
         self._task: asyncio.Task[None] | None = None
-        self.started: asyncio.Future[dict[str, int]] | None = None
+        self.started: asyncio.Future[dict[str, Any]] | None = None
+        self.changes: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+        """Messages about faults."""
         self.stopped = asyncio.Event()
 
     async def connect(self, path: str) -> None:
@@ -44,6 +50,8 @@ class ControlLine:
                     break
                 if "start" in message and self.started is not None and not self.started.done():
                     self.started.set_result(message["start"])
+                if "fault" in message or "end_fault" in message:
+                    self.changes.put_nowait(message)
                 if message.get("stop"):
                     break
         self.stopped.set()

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from agent.clock_faults import FaultyClock
 from agent.config import InjectionPart
-from agent.fault_parts import AnyFaultPart, ClockDriftPart, ClockStepPart, ForgePart, named
+from agent.fault_parts import AnyFaultPart, ClockDriftPart, ClockStepPart, ForgePart, made, named
+from agent.settings import nanoseconds
 from network.forgery import Forger
 from network.injected_transport import CallLater, LinkInjector
 from network.link_feed import LinkFeed
@@ -39,6 +41,7 @@ class Injection:
         self._file: Any = None
         self._clocks: dict[str, FaultyClock] = {}
         self._forgers: list[Forger] = []
+        self._spans: dict[str, tuple[int, int]] = {}
         self._start_ns = 0
         log: Callable[[FateRecord], None] | None = None
         if part.fate_log is not None:
@@ -67,17 +70,35 @@ class Injection:
         """One more fault of links, clocks or forgers. Raises `ValueError` if the name is in use."""
         if isinstance(fault, ClockStepPart | ClockDriftPart):
             self.clock(fault.robot).add(fault.clock(self._start_ns))
+            if fault.robot == self._robot:
+                self._spans[name] = fault.span_ns(self._start_ns)
         elif isinstance(fault, ForgePart):
             forgery = fault.forgery(name, self._start_ns)
             if forgery.reaches(self._robot):
+                self._spans[name] = fault.span_ns(self._start_ns)
                 self._forgers.append(Forger(forgery, self._part.seed, self._robot))
                 self._forge(self._forgers[-1], self._true_ns())
         elif fault.level == "link":
             self.links.faults.add([fault.fault(name, self._start_ns)])
 
-    def end(self, name: str) -> bool:
-        """End a fault of links now; False if there is none of that name that goes on."""
-        return self.links.faults.end(name, self._true_ns())
+    def end(self, name: str, t_ns: int) -> bool:
+        """End a fault of links or a forgery; False if there is none of that name that goes on."""
+        forging = [forger for forger in self._forgers if forger.forgery.name == name]
+        for forger in forging:
+            forger.forgery = replace(forger.forgery, end_ns=min(forger.forgery.end_ns, t_ns))
+            self._spans[name] = (forger.forgery.begin_ns, forger.forgery.end_ns)
+        return self.links.faults.end(name, t_ns) or bool(forging)
+
+    def change(self, message: dict[str, Any]) -> AnyFaultPart | None:
+        """Do what the launcher says; the fault that was added, if one was. Messages as in `agent.control`."""
+        if "end_fault" in message:
+            ended = message["end_fault"]
+            self.end(ended["id"], self._start_ns + nanoseconds(ended["at_s"]))
+            return None
+        fault = made(**message["fault"])
+        assert fault.id is not None
+        self.add(fault.id, fault)
+        return fault
 
     def clock(self, robot: str) -> FaultyClock:
         """The clock of a robot, this one or a sender."""
@@ -103,15 +124,17 @@ class Injection:
 
         def due() -> None:
             packet = forger.packet(following)
-            if packet is not None:
+            if packet is not None and following < forger.forgery.end_ns:
                 self._deliver(packet)
             self._forge(forger, following)
 
         self._call_later(max(following - self._true_ns(), 0), due)
 
     def told(self) -> list[str]:
-        """Names of the faults of links that are on now."""
-        return self.links.faults.active(self._true_ns())
+        """Names of the faults that are on now: of links, of the own clock, of those who forge."""
+        now_ns = self._true_ns()
+        others = [name for name, (begin, end) in self._spans.items() if begin <= now_ns < end]
+        return self.links.faults.active(now_ns) + others
 
     async def close(self) -> None:
         if self._file is not None:

@@ -72,6 +72,7 @@ class AgentShell:
         self._injection: Injection | None = None
         self._recording: RecordingWriter | None = None
         self._control: ControlLine | None = None
+        self._hearing: asyncio.Task[None] | None = None
         self._sensor_transport: asyncio.BaseTransport | None = None
         self._receive: Any = None
         self._timer: asyncio.TimerHandle | None = None
@@ -175,9 +176,23 @@ class AgentShell:
             self._injection.begin(begin["t0_ns"])
             own = self._injection.clock(self.robot)
             self._clock = replace(self._clock, faulty=own)
+            for message in begin.get("changes", []):
+                self._injection.change(message)
             for t_ns in own.changes():
                 self._rearm_at(t_ns)
+        self._hearing = asyncio.create_task(self._hear(self._control))
         return True
+
+    async def _hear(self, control: ControlLine) -> None:
+        """Faults that are added to a run that goes on."""
+        while True:
+            message = await control.changes.get()
+            if self._injection is None:
+                continue
+            fault = self._injection.change(message)
+            if fault is not None and fault.level == "clock":
+                for t_ns in self._injection.clock(self.robot).changes():
+                    self._rearm_at(t_ns)
 
     def _rearm_at(self, t_ns: int) -> None:
         """The own clock changes at the true instant `t_ns`: what was due by it is due at another time."""
@@ -363,6 +378,8 @@ class AgentShell:
     async def _close(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
+        if self._hearing is not None:
+            self._hearing.cancel()
         figures = self._figures() if self._node is not None else None
         state = self._node.agent.saved() if self._node is not None else None
         self._node = None

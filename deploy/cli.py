@@ -1,4 +1,4 @@
-"""The command line: `cofix run`, `montecarlo`, `agent`, `sitl`, `replay`, `report`.
+"""The command line: `cofix run`, `montecarlo`, `agent`, `fault`, `sitl`, `replay`, `report`.
 
 Exit status: 0 done, 1 the run failed its own expectations or an agent died, 2 wrong use, with one line that says
 what to change.
@@ -112,6 +112,17 @@ def parser() -> Parser:
     agent = commands.add_parser("agent", help="run one agent from its configuration file")
     agent.add_argument("config", type=Path)
 
+    fault = commands.add_parser("fault", help="inject a fault by hand into a run of processes that goes on")
+    fault.add_argument(
+        "words",
+        nargs="+",
+        metavar="[RUN_DIR] KIND VALUE|KEY=VALUE ...",
+        help="a kind of fault and its keys as in [[faults]]; or 'list', or 'end NAME'; default: the newest run",
+    )
+    fault.add_argument("--for", dest="lasting", type=_seconds, metavar="S", help="so long; default: to the end")
+    fault.add_argument("--links", metavar="ID,ID", help="only on the links among these robots")
+    fault.add_argument("--json", action="store_true", help="print the answer as JSON")
+
     sitl = commands.add_parser("sitl", help="an autopilot stand-in that drives a circle, for desk tests")
     sitl.add_argument("--endpoint", default="udpout:127.0.0.1:14550", help="where the companion listens")
     sitl.add_argument("--system-id", type=_count, default=1)
@@ -142,6 +153,7 @@ def main(arguments: list[str] | None = None) -> int:
         "run": _run,
         "montecarlo": _montecarlo,
         "agent": _agent,
+        "fault": _fault,
         "sitl": _sitl,
         "replay": _replay,
         "report": _report,
@@ -189,6 +201,12 @@ def _agent(options: argparse.Namespace) -> int:
     except (ConnectionError, FileNotFoundError) as error:
         return fail(f"control_socket {config.control_socket}: {error.strerror}; start the run with 'cofix run'")
     return 0
+
+
+def _fault(options: argparse.Namespace) -> int:
+    from deploy.fault import fault
+
+    return fault(options)
 
 
 def _sitl(options: argparse.Namespace) -> int:

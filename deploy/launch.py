@@ -28,6 +28,8 @@ import tomli_w
 from agent.estimation.motion import LAYOUTS
 from agent.fault_parts import AnyFaultPart, CrashPart, PausePart, RestartPart
 from agent.settings import NS
+from deploy.fault import SOCKET
+from deploy.live_faults import LiveFaults
 from network.transport import free_port
 from network.zenoh_transport import link_pair
 from sim.agents import agent_tables, autopilot_fix, odometry_table, table
@@ -38,6 +40,8 @@ from sim.world import World
 
 READY_TIMEOUT_S = 30.0
 LEAD_S = 2.0
+TOLD_S = 0.2
+"""Wall time within which all processes have heard of a fault that is injected by hand."""
 STOP_TIMEOUT_S = 15.0
 SILENT_S = 10.0
 WORLD = "world"
@@ -64,6 +68,8 @@ class Member:
     log: Path
     writer: asyncio.StreamWriter | None = None
     ready: bool = False
+    told: bool = False
+    """When the run started."""
     status: dict[str, Any] = field(default_factory=dict)
     done: dict[str, Any] | None = None
     exit_code: int | None = None
@@ -175,6 +181,7 @@ class Launcher:
         self._private = Path()
         self._past: dict[str, list[dict[str, Any]]] = {}
         self._nemesis: list[asyncio.Task[None]] = []
+        self._faults = LiveFaults(scenario, seed, lambda: self.t_s(TOLD_S), self._tell_all, self._strike_soon)
 
     async def run(self, show: Callable[[Launcher], None] | None = None) -> Outcome:
         """Run to the end. Raises `LaunchError` when the run could not start or the world failed."""
@@ -189,13 +196,13 @@ class Launcher:
             server = await asyncio.start_unix_server(self._serve, path=plan.control_socket, limit=2**22)
             await self._start(private)
             await self._barrier()
-            self._nemesis = [
-                asyncio.create_task(self._strike(name, fault))
-                for name, fault in trial_faults(self._scenario, self._seed).items()
-                if fault.level == "process"
-            ]
+            for name, fault in self._faults.faults.items():
+                if fault.level == "process":
+                    self._strike_soon(name, fault)
+            await self._faults.serve(private / SOCKET)
             await self._watch(show)
         finally:
+            self._faults.close()
             for task in self._nemesis:
                 task.cancel()
             await asyncio.gather(*self._nemesis, return_exceptions=True)
@@ -211,6 +218,21 @@ class Launcher:
         """Share of the run that is played, in [0, 1]."""
         world = self.members.get(WORLD)
         return float(world.status.get("progress", 0.0)) if world is not None else 0.0
+
+    def t_s(self, ahead_s: float = 0.0) -> float:
+        """The instant of the run, or that in so much wall time, in seconds of fleet time since its start."""
+        if self._begin is None:
+            return 0.0
+        wall_ns = time.monotonic_ns() - self._begin["monotonic0_ns"] + int(ahead_s * NS)
+        return max(wall_ns / NS * self._speed, 0.0)
+
+    def injected(self) -> list[str]:
+        """Names of the faults that are on now."""
+        return self._faults.active(self.t_s()) if self._begin is not None else []
+
+    def played(self) -> Scenario:
+        """The scenario with the faults there were, those by hand too."""
+        return self._faults.played()
 
     # -- start ----------------------------------------------------------------------------------------------
 
@@ -285,7 +307,8 @@ class Launcher:
                 member.heard_s = time.monotonic()
                 member.ready = member.ready or "ready" in message
                 if "ready" in message and self._begin is not None:
-                    self._tell(member, {"start": self._begin})
+                    self._tell(member, {"start": {**self._begin, "changes": self._faults.changes}})
+                    member.told = True
                 if "status" in message:
                     member.status = message["status"]
                 if "done" in message:
@@ -308,6 +331,7 @@ class Launcher:
         self._begin = {"t0_ns": self._t0_ns, "monotonic0_ns": time.monotonic_ns() + int(LEAD_S * NS)}
         for member in self.members.values():
             self._tell(member, {"start": self._begin})
+            member.told = True
 
     # -- faults of processes --------------------------------------------------------------------------------
 
@@ -317,23 +341,38 @@ class Launcher:
         due_ns = self._begin["monotonic0_ns"] + int(at_s / self._speed * NS)
         await asyncio.sleep(max(due_ns - time.monotonic_ns(), 0) / NS)
 
+    async def _over(self, name: str, fault: AnyFaultPart) -> None:
+        """Wait until a fault is over: by its own time, never without one, or because it is ended by hand."""
+        over = self._faults.over(name)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(None) as limit:
+                if fault.for_s is not None:
+                    wait_s = (fault.at_s + fault.for_s - self.t_s()) / self._speed
+                    limit.reschedule(asyncio.get_running_loop().time() + max(wait_s, 0.0))
+                await over.wait()
+
+    def _strike_soon(self, name: str, fault: AnyFaultPart) -> None:
+        self._nemesis.append(asyncio.create_task(self._strike(name, fault)))
+
     async def _strike(self, name: str, fault: AnyFaultPart) -> None:
         """Play a fault of a process."""
         await self._until(fault.at_s)
+        if self._faults.over(name).is_set():
+            return
         match fault:
             case CrashPart():
                 await self._kill(fault.robot, signal.SIGKILL)
-                if fault.for_s is not None:
-                    await self._until(fault.at_s + fault.for_s)
-                    await self._revive(fault.robot, fault.state == "kept")
+                await self._over(name, fault)
+                await self._revive(fault.robot, fault.state == "kept")
             case RestartPart():
                 await self._kill(fault.robot, signal.SIGTERM)
-                await self._until(fault.at_s + (fault.for_s or 0.0))
+                if fault.for_s is not None:
+                    await self._over(name, fault)
                 await self._revive(fault.robot, True)
             case PausePart():
                 self._signal(fault.robot, signal.SIGSTOP)
                 try:
-                    await self._until(fault.at_s + fault.for_s)
+                    await self._over(name, fault)
                 finally:
                     self._signal(fault.robot, signal.SIGCONT)
 
@@ -346,6 +385,8 @@ class Launcher:
     async def _kill(self, robot: str, number: int) -> None:
         """End an agent, and wait until it is gone."""
         member = self.members[robot]
+        if member.gone:
+            return
         member.gone = True
         self._signal(robot, number)
         if member.reaper is not None:
@@ -408,6 +449,12 @@ class Launcher:
     def _interrupt(self) -> None:
         self._interrupted = True
         self._changed.set()
+
+    def _tell_all(self, message: dict[str, Any]) -> None:
+        """Tell those that have started; who starts later is told with the start."""
+        for member in self.members.values():
+            if member.told:
+                self._tell(member, message)
 
     def _tell(self, member: Member, message: dict[str, Any]) -> None:
         if member.writer is not None and not member.writer.is_closing():

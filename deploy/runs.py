@@ -79,6 +79,8 @@ def run(options: argparse.Namespace) -> int:
             if figures:
                 lags.heard(round(figures["lag_max_s"] * 1e9), figures["lags"])
         lag_p99_s = lags.percentile_ns(0.99) * 1e-9
+        scenario = launcher.played()
+        write_scenario(scenario, run_dir)
         result = collect(scenario, world, run_dir, outcome, options.bound, options.seed)
         merge_recordings(scenario, run_dir)
         merge_fates(scenario, run_dir)

@@ -161,11 +161,11 @@ class LiveTable:
         played = launcher.progress() * self._scenario.duration_s
         title = f"{self._scenario.name}  {played:.0f} / {self._scenario.duration_s:.0f} s  at {self._speed:g} x"
         links = self._scenario.links.model_dump(exclude_defaults=True)
-        injected = ", ".join(f"{name} {value:g}" for name, value in links.items())
+        injected = ", ".join([*(f"{name} {value:g}" for name, value in links.items()), *launcher.injected()])
         table = Table(
             title=title,
             title_justify="left",
-            caption=f"injected at every receiver: {injected}" if injected else None,
+            caption=f"injected: {injected}" if injected else None,
             caption_justify="left",
         )
         for name in LIVE_TEXT:

@@ -23,9 +23,19 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from agent.clock_faults import FaultyClock
 from agent.control import ControlLine
 from agent.estimation.motion import LAYOUTS
-from agent.fault_parts import BiasPart, ClockDriftPart, ClockStepPart, DropoutPart, OutliersPart, SilencePart
+from agent.fault_parts import (
+    AnyFaultPart,
+    BiasPart,
+    ClockDriftPart,
+    ClockStepPart,
+    DropoutPart,
+    OutliersPart,
+    SilencePart,
+    made,
+)
 from agent.fleet_clock import FleetClock
 from agent.sensor_input import encode
+from agent.settings import nanoseconds
 from network.link_feed import LinkFeed
 from sim.agents import autopilot_fix
 from sim.autopilot import StandIn, StandInServer
@@ -86,12 +96,14 @@ class WorldHost:
         await self._feed.serve(self._plan.link_endpoint)
         control.say({"ready": "world"})
         stop = asyncio.ensure_future(control.stopped.wait())
+        hear: asyncio.Future[None] | None = None
         try:
             assert control.started is not None
             begin = await control.started
             clock = FleetClock(begin["t0_ns"], begin["monotonic0_ns"], self._plan.speed)
             self._inject(clock.t0_ns)
             await self._start_vehicles(clock)
+            hear = asyncio.ensure_future(self._hear(clock.t0_ns, control))
             play = asyncio.ensure_future(self._play(clock, control))
             await asyncio.wait({play, stop}, return_when=asyncio.FIRST_COMPLETED)
             if play.done():
@@ -106,6 +118,8 @@ class WorldHost:
             pass
         finally:
             stop.cancel()
+            if hear is not None:
+                hear.cancel()
             for server in self._servers.values():
                 await server.close()
             self._socket.close()
@@ -116,13 +130,28 @@ class WorldHost:
     def _inject(self, t0_ns: int) -> None:
         """The faults of sensors, autopilots and clocks; the rest is for receivers and the launcher."""
         for name, fault in trial_faults(self._scenario, self._plan.seed).items():
-            match fault:
-                case DropoutPart() | OutliersPart() | BiasPart() | SilencePart():
-                    self._world.add(name, fault)
-                case ClockStepPart() | ClockDriftPart():
-                    self._clocks[fault.robot].add(fault.clock(t0_ns))
-                case _:
-                    pass
+            self._add(name, fault, t0_ns)
+
+    def _add(self, name: str, fault: AnyFaultPart, t0_ns: int) -> None:
+        match fault:
+            case DropoutPart() | OutliersPart() | BiasPart() | SilencePart():
+                self._world.add(name, fault)
+            case ClockStepPart() | ClockDriftPart():
+                self._clocks[fault.robot].add(fault.clock(t0_ns))
+            case _:
+                pass
+
+    async def _hear(self, t0_ns: int, control: ControlLine) -> None:
+        """Faults that are added to the run, and ended, while it goes on."""
+        while True:
+            message = await control.changes.get()
+            if "end_fault" in message:
+                ended = message["end_fault"]
+                self._world.end(ended["id"], nanoseconds(ended["at_s"]))
+                continue
+            fault = made(**message["fault"])
+            assert fault.id is not None
+            self._add(fault.id, fault, t0_ns)
 
     async def _start_vehicles(self, clock: FleetClock) -> None:
         for index, (robot, port) in enumerate(sorted(self._plan.mavlink_ports.items())):

@@ -11,7 +11,7 @@ from agent.config_parts import (
 )
 from agent.estimation.motion import LAYOUTS
 from agent.estimation.observation import RELATIVE_ANGLES
-from agent.fault_parts import SensorFaultPart, check_faults, named
+from agent.fault_parts import AnyFaultPart, SensorFaultPart, check_faults, named
 from agent.joint_room import check_room
 from agent.start_config import check_start
 from sim.scenario import KINDS, MIN_STEP_S, RobotPart, Scenario, SensorPart, TargetPart, sensor_kind
@@ -53,7 +53,7 @@ def check(scenario: Scenario) -> None:
         )
     _check_steering(scenario)
     _check_team(scenario)
-    _check_faults(scenario)
+    check_schedule(scenario, scenario.faults)
     for robot in scenario.robots:
         _check_mover(f"{scenario.name}: robots.{robot.id}", robot)
         if recorded and LAYOUTS[robot.model].altitude is not None:
@@ -99,14 +99,14 @@ def check(scenario: Scenario) -> None:
             raise ConfigError(f"{scenario.name}: targets.{target.id}.start.pose is missing")
 
 
-def _check_faults(scenario: Scenario) -> None:
-    """Faults are of robots and sensors that are there."""
+def check_schedule(scenario: Scenario, faults: list[AnyFaultPart]) -> None:
+    """Faults are of robots and sensors that are there, and begin before the end. Raises `ConfigError`."""
     robots = {robot.id: robot for robot in scenario.robots}
     try:
-        check_faults(scenario.faults, robots)
+        check_faults(faults, robots)
     except ConfigError as error:
         raise ConfigError(f"{scenario.name}: {error}") from None
-    for name, fault in named(scenario.faults).items():
+    for name, fault in named(faults).items():
         where = f"{scenario.name}: faults.{name}"
         if isinstance(fault, SensorFaultPart) and fault.sensor is not None:
             there = sorted(robots[fault.robot].sensors)

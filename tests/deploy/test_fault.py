@@ -1,0 +1,260 @@
+"""Faults by hand: what `cofix fault` understands, what the launcher answers, and a run into which they are injected."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agent.config_file import ConfigError
+from agent.fault_parts import AnyFaultPart, CrashPart
+from deploy.fault import socket_of, split, wanted
+from deploy.live_faults import LiveFaults
+from sim.scenario import Scenario
+from sim.scenario_file import load
+from sim.store import load_trace
+
+COFIX = (sys.executable, "-P", "-m", "deploy.cli")
+
+WORDS: list[tuple[str, dict[str, Any]]] = [
+    ("partition r1,r2 r3", {"kind": "partition", "groups": [["r1", "r2"], ["r3"]]}),
+    ("loss 0.5", {"kind": "loss", "share": 0.5}),
+    ("kill r3", {"kind": "crash", "robot": "r3"}),
+    ("crash r3 state=lost", {"kind": "crash", "robot": "r3", "state": "lost"}),
+    ("pause r2 for_s=2.0", {"kind": "pause", "robot": "r2", "for_s": 2.0}),
+    ("clock_step r2 -0.3", {"kind": "clock_step", "robot": "r2", "offset_s": -0.3}),
+    (
+        "delay delay_s=0.1 sources=r1 destinations=r2,r3 both_ways=false",
+        {"kind": "delay", "delay_s": 0.1, "sources": ["r1"], "destinations": ["r2", "r3"], "both_ways": False},
+    ),
+    (
+        "sensor_dropout r1 range of=landmark:L3",
+        {"kind": "sensor_dropout", "robot": "r1", "sensor": "range", "of": "landmark:L3"},
+    ),
+]
+
+
+@pytest.mark.parametrize(("words", "keys"), WORDS, ids=[words for words, _ in WORDS])
+def test_words_become_keys_of_the_schema(words: str, keys: dict[str, Any]) -> None:
+    assert wanted(words.split()) == {"inject": keys}
+
+
+def test_links_and_time_are_options() -> None:
+    assert wanted(["loss", "0.5"], "r1,r2", 10.0) == {
+        "inject": {
+            "kind": "loss",
+            "share": 0.5,
+            "sources": ["r1", "r2"],
+            "destinations": ["r1", "r2"],
+            "for_s": 10.0,
+        }
+    }
+
+
+def test_a_run_directory_may_come_first() -> None:
+    assert split(["runs/one", "kill", "r3"]) == (Path("runs/one"), ["kill", "r3"])
+    assert split(["list"]) == (None, ["list"])
+
+
+@pytest.mark.parametrize("words", [["kil", "r3"], ["runs/one"], ["runs/one", "kil", "r3"]])
+def test_what_is_no_fault_is_answered_with_those_there_are(words: list[str]) -> None:
+    with pytest.raises(ConfigError, match="none of list, end, kill, partition"):
+        split(words)
+
+
+@pytest.mark.parametrize("words", [["end"], ["list", "all"], ["kill", "r3", "r4"]])
+def test_words_too_many_or_too_few(words: list[str]) -> None:
+    with pytest.raises(ConfigError, match="fault: "):
+        wanted(words)
+
+
+def test_without_a_run_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(ConfigError, match="no run of processes goes on"):
+        socket_of(None)
+    with pytest.raises(ConfigError, match="not the directory of a run of processes"):
+        socket_of(tmp_path)
+
+
+# -- the launcher's side ------------------------------------------------------------------------------------
+
+
+class Run:
+    """A run that is at 10 s, and what it was told."""
+
+    def __init__(self) -> None:
+        self.scenario: Scenario = load("ut-clat")
+        self.at_s = 10.0
+        self.told: list[dict[str, Any]] = []
+        self.struck: list[tuple[str, AnyFaultPart]] = []
+        self.faults = LiveFaults(
+            self.scenario,
+            1,
+            lambda: self.at_s,
+            self.told.append,
+            lambda name, fault: self.struck.append((name, fault)),
+        )
+
+    def refused(self, request: dict[str, Any]) -> str:
+        answer = self.faults.answer(request)
+        assert not self.told and self.faults.played() is self.scenario
+        return str(answer["error"])
+
+
+def test_a_fault_is_from_now_on_and_told_to_all() -> None:
+    run = Run()
+    assert "loss-1" in run.faults.answer({"inject": {"kind": "loss", "share": 0.5}})["done"]
+    (message,) = run.told
+    assert message["fault"]["id"] == "loss-1" and message["fault"]["at_s"] == 10.0
+    assert run.faults.active(10.0) == ["loss-1"] and run.faults.active(9.9) == []
+    assert not run.struck
+
+
+def test_what_was_done_by_hand_is_a_schedule_that_can_be_played_again() -> None:
+    run = Run()
+    run.faults.answer({"inject": {"kind": "loss", "share": 0.5}})
+    run.at_s = 14.0
+    assert run.faults.answer({"end": "loss-1"}) == {"done": "loss-1 is ended"}
+    (fault,) = run.faults.played().faults
+    assert (fault.id, fault.at_s, fault.for_s) == ("loss-1", 10.0, 4.0)
+    assert run.told[1] == {"end_fault": {"id": "loss-1", "at_s": 14.0}}
+    assert run.faults.changes == run.told
+
+
+def test_faults_of_processes_are_played_by_the_launcher() -> None:
+    run = Run()
+    run.faults.answer({"inject": {"kind": "crash", "robot": "r3"}})
+    ((name, fault),) = run.struck
+    assert isinstance(fault, CrashPart) and fault.robot == "r3"
+    assert not run.faults.over(name).is_set()
+    run.at_s = 15.0
+    run.faults.answer({"end": name})
+    assert run.faults.over(name).is_set()
+
+
+@pytest.mark.parametrize(
+    ("request_", "words"),
+    [
+        ({"inject": {"kind": "los", "share": 0.5}}, "did you mean 'loss'?"),
+        ({"inject": {"kind": "loss", "shre": 0.5}}, "did you mean 'share'?"),
+        ({"inject": {"kind": "loss", "share": 1.5}}, "share' = 1.5"),
+        ({"inject": {"kind": "crash", "robot": "r9"}}, "no robot 'r9'"),
+        ({"inject": {"kind": "loss", "share": 0.5, "at_s": 3.0}}, "at_s = 3 is over; the run is at 10 s"),
+        ({"inject": {"kind": "loss", "share": 0.5, "at_s": 1e6}}, "after the run's end"),
+        ({"inject": {"kind": "sensor_dropout", "robot": "r1", "sensor": "sonar"}}, "has no sensor 'sonar'"),
+        ({"inject": {}}, "kind' is missing"),
+        ({"inject": {"kind": "loss", "share": 0.5, "id": 7}}, "id' = 7"),
+        ({"end": "loss-1"}, "there is no 'loss-1' that goes on; there are: none"),
+        ({"stop": True}, "inject, end or list"),
+        ([], "inject, end or list"),
+    ],
+)
+def test_what_is_wrong_is_answered_and_changes_nothing(request_: Any, words: str) -> None:
+    assert words in Run().refused(request_)
+
+
+def test_names_differ_and_a_clock_that_was_set_stays() -> None:
+    run = Run()
+    run.faults.answer({"inject": {"kind": "clock_step", "robot": "r1", "offset_s": 0.1, "id": "wrong"}})
+    again = run.faults.answer({"inject": {"kind": "loss", "share": 0.5, "id": "wrong"}})
+    assert "'wrong' is used already" in again["error"]
+    assert "a clock that was set stays so" in run.faults.answer({"end": "wrong"})["error"]
+    assert [entry[:2] for entry in run.faults.answer({"list": True})["faults"]] == [["wrong", True]]
+
+
+# -- a run of processes -------------------------------------------------------------------------------------
+
+SCENARIO = """
+version = 1
+name = "trio"
+duration_s = 60.0
+step_s = 0.5
+window_s = [5.0, 60.0]
+
+[localization]
+pair_interval_s = 1.0
+pair_timeout_s = 2.0
+
+[lateness]
+horizon_s = 10.0
+clock_sigma_s = 1.0
+"""
+
+ROBOT = """
+[[robots]]
+id = "r{k}"
+start = {{ pose = [{k}.0, {k}.0, 0.0] }}
+start_sigma = {{ position_m = 0.5, heading_rad = 0.05 }}
+control = {{ speed_mps = 0.3, yaw_rate_radps = 0.1 }}
+noise = {{ speed_mps = 0.1, yaw_rate_radps = 0.01 }}
+autopilot = {{ sends = ["odometry", "global_position", "attitude"] }}
+sensors = {{ range = {{ of = ["peers"], sigma_m = 0.1 }}, pose = {{ sigma_m = 0.5, sigma_rad = 0.05 }} }}
+"""
+
+
+def test_a_run_that_goes_on_is_broken_and_healed_by_hand(tmp_path: Path) -> None:
+    (tmp_path / "trio.toml").write_text(SCENARIO + "".join(ROBOT.format(k=k) for k in (1, 2, 3)))
+    out = tmp_path / "run"
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+
+    def fault(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [*COFIX, "fault", *words], capture_output=True, text=True, env=environment, timeout=30, check=False
+        )
+
+    def injected(*words: str) -> str:
+        done = fault(str(out), *words)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.partition(":")[0]
+
+    run = subprocess.Popen(
+        [*COFIX, "run", "trio.toml", "--runtime", "processes", "--speed", "4", "--json", "--seed", "3", "--out", "run"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        cwd=tmp_path,
+    )
+    try:
+        deadline = time.monotonic() + 60.0
+        while not (there := list(tmp_path.glob("cofix-*/faults.sock"))) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert stat.S_IMODE(there[0].stat().st_mode) == 0o600
+        cut = injected("partition", "r1,r2", "r3")
+        killed = injected("kill", "r2")
+        injected("clock_step", "r1", "0.3")
+        injected("sensor_dropout", "r3", "range", "--for", "5")
+        wrong = fault("isolate", "r7")
+        assert wrong.returncode == 2 and "no robot 'r7'" in wrong.stderr
+        listed = fault(str(out), "list").stdout
+        assert f"on  {cut}:" in listed
+        injected("end", cut)
+        injected("end", killed)
+        stdout, stderr = run.communicate(timeout=90)
+    finally:
+        run.kill()
+        run.wait()
+    assert run.returncode == 0, stderr
+    summary = json.loads(stdout)
+    assert [text.split()[0] for text in summary["faults"]] == ["partition", "crash", "clock_step", "sensor_dropout"]
+    assert summary["exit"] == {"r1": 0, "r2": 0, "r3": 0} and summary["fleet"]["anees"] < 2.0
+    with (out / "fates.csv").open(newline="") as file:
+        lost = {(row["source"], row["destination"]) for row in csv.DictReader(file) if row["cause"] == cut}
+    assert lost and all("r3" in link for link in lost)
+    # Who was killed was gone for as long as is told, and came back.
+    played = {fault.id: fault for fault in load(str(out / "scenario.toml")).faults}
+    crash, trace = played[killed], load_trace(out).trace
+    assert crash.for_s is not None and played.keys() == {cut, killed, "clock_step-3", "sensor_dropout-4"}
+    known = np.isfinite(trace.robots["r2"].mean).all(axis=1)
+    gone = (trace.t_s > crash.at_s + 1.5) & (trace.t_s < crash.at_s + crash.for_s)
+    assert gone.any() and not known[gone].any() and known[-3:].all()
+    assert not list(tmp_path.glob("cofix-*"))
