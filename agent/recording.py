@@ -96,7 +96,7 @@ class RecordingWriter:
     def __init__(self, path: Path) -> None:
         self._file: BinaryIO = path.open("wb")
         # Small chunks: a writer that is killed loses only the last one.
-        self._writer = Writer(self._file, chunk_size=1 << 16, compression=CompressionType.NONE)
+        self._writer = Writer(self._file, chunk_size=1 << 14, compression=CompressionType.NONE)
         self._writer.start(profile="cofix", library="cofix")
         self._channels: dict[str, int] = {}
         self._sequence = 0
