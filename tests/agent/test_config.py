@@ -327,6 +327,8 @@ def test_an_autopilot_beyond_loopback_counts_as_real(tmp_path: Path, endpoint: s
     """Whatever it is declared to be: nothing is injected, and time is real."""
     mavlink = {"endpoint": endpoint, "simulated": True}
     assert "[injection]" in complaint(tmp_path, example(mavlink=mavlink, injection={"seed": 1}))
+    faults = [{"kind": "clock_step", "robot": "r1", "offset_s": 1.0}]
+    assert "[injection]" in complaint(tmp_path, example(mavlink=mavlink, injection={"seed": 1, "faults": faults}))
     assert "clock.source" in complaint(tmp_path, example(mavlink=mavlink, clock={"source": "run"}))
     assert load_agent_config(write(tmp_path, example(mavlink=mavlink))).mavlink is not None
 
