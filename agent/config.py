@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -179,16 +180,20 @@ class AgentConfig(Part):
         mean, cov = self.initial.belief(self.motion)
         # The paper predicts each step by itself; intersections of tracks leave room enough for what that misses.
         form = self.localization.form if self.localization.kind == "clat" else None
-        own, theirs = form != "published", form not in ("safe", "published")
+        motion = self.motion.settings()
+        if form == "published":
+            motion = replace(motion, persistent_rad2=math.inf)
         targets = [target.settings() for target in self.targets]
+        if form in ("safe", "published"):
+            targets = [replace(item, motion=replace(item.motion, persistent_rad2=math.inf)) for item in targets]
         return AgentSettings(
             robot=self.identity.robot,
             start_ns=start_ns,
             mean=mean,
             cov=cov,
             source=self.initial.source,
-            motion=replace(self.motion.settings(), persistent=own),
-            targets=tuple(replace(item, motion=replace(item.motion, persistent=theirs)) for item in targets),
+            motion=motion,
+            targets=tuple(targets),
             landmarks={item.id: item.place() for item in self.landmarks},
             one_way_sensors=tuple(name for name, part in sorted(self.sensors.items()) if not part.two_way),
             localization=self.localization.settings(),

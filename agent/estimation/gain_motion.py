@@ -83,7 +83,7 @@ class GainMotion(RobotMotion):
             moved, F, G = _linearized(mean, increment)
             return Propagated(moved, F @ cov @ F.T + G @ noise @ G.T + walked, F)
         heading = UNICYCLE_GAINS.angles[0]
-        found = moved_in_its_frame(mean, cov, increment, noise, heading, (ALONG, TURN), self.persistent)
+        found = moved_in_its_frame(mean, cov, increment, noise, heading, (ALONG, TURN), self.persistent_rad2)
         return Propagated(found.mean, found.cov + walked, found.F)
 
 

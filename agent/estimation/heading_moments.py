@@ -32,10 +32,6 @@ from agent.estimation.unscented import Propagated
 
 Array = NDArray[np.float64]
 
-PERSISTENT_RAD2 = 0.1
-"""Variance of a heading from which on what a step leaves over counts as correlated with what earlier ones left over."""
-
-
 
 def moved_in_its_frame(
     mean: Array,
@@ -44,13 +40,14 @@ def moved_in_its_frame(
     noise: Array,
     heading: int,
     gains: tuple[int, int] | None = None,
-    persistent: bool = True,
+    persistent_rad2: float = math.inf,
 ) -> Propagated:
     """Belief (n,), (n, n) of a state x, y, ... after a body increment, with noise in the body frame at its beginning.
 
     delta (k,) and noise (k, k) are of the increment's dx, dy, [dz,] dyaw, dz being of the third component. `heading`
     says where the heading sits, `gains` the gains of forward motion and of turning: the chord then leans by half of
-    what the turn is longer. The mean's heading is wrapped. `persistent` False: the moments of this step alone.
+    what the turn is longer. The mean's heading is wrapped. `persistent_rad2`: variance of a
+    heading from which on what steps leave over counts as correlated; infinite: the moments of this step alone.
     """
     n, steps = len(mean), delta.tolist()
     dyaw, u = steps[-1], complex(steps[0], steps[1])
@@ -90,7 +87,7 @@ def moved_in_its_frame(
     spread = abs(u) ** 2 * (scale**2 + V) - abs(step) ** 2 - linear
     pseudo = u**2 * ((scale + 2j * C) ** 2 + V) * cmath.exp(2j * phi - 2.0 * s2) - step**2 - pseudo_linear
     place = float(new[0, 0] + new[1, 1])
-    if persistent and s2 > PERSISTENT_RAD2 and place > 0.0 and spread > 0.0:
+    if s2 > persistent_rad2 and place > 0.0 and spread > 0.0:
         ratio = math.sqrt(spread / place)
         new[:2, :2] *= 1.0 + ratio
         spread, pseudo = spread * (1.0 + 1.0 / ratio), pseudo * (1.0 + 1.0 / ratio)

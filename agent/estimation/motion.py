@@ -110,7 +110,7 @@ def advance(
     delta: Array,
     delta_cov: Array,
     transform: Transform,
-    persistent: bool = True,
+    persistent_rad2: float = math.inf,
 ) -> Propagated:
     """Move a unicycle belief (3,), (3, 3) by an odometry increment (4,) with covariance (4, 4).
 
@@ -126,7 +126,7 @@ def advance(
         G = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         moved[2] = wrap(moved[2])
         return Propagated(moved, F @ cov @ F.T + G @ noise @ G.T, F)
-    return moved_in_its_frame(mean, cov, increment, noise, 2, persistent=persistent)
+    return moved_in_its_frame(mean, cov, increment, noise, 2, persistent_rad2=persistent_rad2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +144,7 @@ def advance_spatial(
     delta_cov: Array,
     transform: Transform,
     held: HeldAltitude | None = None,
-    persistent: bool = True,
+    persistent_rad2: float = math.inf,
 ) -> Propagated:
     """Move a belief of x, y, z, heading (4,), (4, 4) by an odometry increment (4,) with covariance (4, 4).
 
@@ -160,7 +160,7 @@ def advance_spatial(
         G[:2, :2] = [[cos, -sin], [sin, cos]]
         found = Propagated(moved, F @ cov @ F.T + G @ delta_cov @ G.T, F)
     else:
-        found = moved_in_its_frame(mean, cov, delta, delta_cov, 3, persistent=persistent)
+        found = moved_in_its_frame(mean, cov, delta, delta_cov, 3, persistent_rad2=persistent_rad2)
     if held is not None:
         found.mean[2] = held.altitude_m
         found.F[2, :] = 0.0
@@ -173,11 +173,12 @@ def advance_spatial(
 class RobotMotion:
     """How a robot's own state moves with its odometry; here x, y, heading.
 
-    `persistent`: a heading that is off stays off, see `agent.estimation.heading_moments`.
+    `persistent_rad2`: variance of a heading from which on it matters that one that is off stays off, see
+    `agent.estimation.heading_moments`; where it is less, measurements correct it before that.
     """
 
     layout: StateLayout = UNICYCLE
-    persistent: bool = True
+    persistent_rad2: float = 1.0
 
     def advance(
         self,
@@ -189,7 +190,7 @@ class RobotMotion:
         transform: Transform,
         ) -> Propagated:
         """Belief (n,), (n, n) after an odometry increment (4,) with covariance (4, 4) over `dt_s` > 0 seconds."""
-        return advance(mean, cov, delta, delta_cov, transform, self.persistent)
+        return advance(mean, cov, delta, delta_cov, transform, self.persistent_rad2)
 
 
 PLANAR_MOTION = RobotMotion()
@@ -211,7 +212,7 @@ class SpatialMotion(RobotMotion):
         dt_s: float,
         transform: Transform,
         ) -> Propagated:
-        return advance_spatial(mean, cov, delta, delta_cov, transform, self.held, self.persistent)
+        return advance_spatial(mean, cov, delta, delta_cov, transform, self.held, self.persistent_rad2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,7 +226,8 @@ class TargetMotion:
     constant_acceleration   white jerk noise on each axis.
 
     Noise is given as standard deviation of a control (of an axis) held over `noise_step_s`; a step of another length dt
-    keeps the same spectral density: variance sigma^2 noise_step_s / dt of a control held over dt.
+    keeps the same spectral density: variance sigma^2 noise_step_s / dt of a control held over dt. `persistent_rad2` as
+    of robots; less, since what is out of sight is not corrected.
     """
 
     layout: StateLayout
@@ -234,7 +236,7 @@ class TargetMotion:
     noise_step_s: float = 1.0
     damping_s: float = 2.0
     held: HeldAltitude | None = None
-    persistent: bool = True
+    persistent_rad2: float = 0.1
 
     def drift(self, mean: Array, cov: Array, dt_s: float, transform: Transform) -> Propagated:
         """Belief (n,), (n, n) after `dt_s` > 0 seconds."""
@@ -245,8 +247,8 @@ class TargetMotion:
         delta = np.array([speed, 0.0, 0.0, turn])
         noise = np.diag([(self.noise_sigma[0] * scale) ** 2, 0.0, 0.0, (self.noise_sigma[1] * scale) ** 2])
         if self.layout is SPATIAL:
-            return advance_spatial(mean, cov, delta, noise, transform, self.held, self.persistent)
-        return advance(mean, cov, delta, noise, transform, self.persistent)
+            return advance_spatial(mean, cov, delta, noise, transform, self.held, self.persistent_rad2)
+        return advance(mean, cov, delta, noise, transform, self.persistent_rad2)
 
     def _drift_velocity(self, mean: Array, cov: Array, dt: float) -> Propagated:
         F, Q = velocity_step(self.layout, dt, self.damping_s)

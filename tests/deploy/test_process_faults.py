@@ -160,8 +160,9 @@ def test_equal_packets_have_equal_fates(runs: tuple[Path, dict[str, Any], dict[s
     """Loss, damage and delay follow from what a packet is; its instant decides about spells and partitions alone."""
     folder = runs[0]
     virtual, processes = fates(folder / "virtual"), fates(folder / "processes")
-    shared = virtual.keys() & processes.keys()
-    assert len(shared) > 300
+    # A robot that has started again counts its packets anew: those of two lives bear the same numbers.
+    shared = {name for name in virtual.keys() & processes.keys() if name[0] in ("r1", "r2")}
+    assert len(shared) > 200
     timed = ("burst_loss-2", "partition-6")
     differing = 0
     for name in shared:
@@ -169,7 +170,7 @@ def test_equal_packets_have_equal_fates(runs: tuple[Path, dict[str, Any], dict[s
         if a["cause"] in timed or b["cause"] in timed:
             continue
         differing += any(a[key] != b[key] for key in ("cause", "lost", "delay_ns", "corrupted"))
-    assert differing <= 0.01 * len(shared)
+    assert differing == 0
     assert {row["cause"] for row in processes.values()} >= {"loss-1", "burst_loss-2", "partition-6", ""}
 
 

@@ -58,7 +58,7 @@ def test_the_moments_are_those_of_samples(case: str, sigma: float) -> None:
     delta = rng.normal(size=k)
     spread = rng.normal(size=(k, k)) * 0.3
     noise = spread @ spread.T
-    found = moved_in_its_frame(mean, cov, delta, noise, heading, gains, persistent=False)
+    found = moved_in_its_frame(mean, cov, delta, noise, heading, gains)
     before, after = cloud(mean, cov, delta, noise, heading, gains)
     assert np.linalg.norm(found.mean - after.mean(axis=0)) < 0.02 * max(1.0, sigma)
     sampled = np.cov(after.T)
@@ -106,7 +106,7 @@ def test_who_heads_anywhere_and_goes_on_ends_up_anywhere(sigma_rad: float) -> No
     starts = np.sqrt(np.diagonal(cov)) * rng.standard_normal((4000, 3))
     mean = np.zeros(3)
     for _ in range(60):
-        moved = moved_in_its_frame(mean, cov, np.array([0.1, 0.0, 0.0]), np.zeros((3, 3)), 2)
+        moved = moved_in_its_frame(mean, cov, np.array([0.1, 0.0, 0.0]), np.zeros((3, 3)), 2, persistent_rad2=0.1)
         mean, cov = moved.mean, moved.cov
     truth = starts[:, :2] + 6.0 * np.stack([np.cos(starts[:, 2]), np.sin(starts[:, 2])], axis=1)
     error = truth - mean[:2]
