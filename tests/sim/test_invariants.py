@@ -34,7 +34,7 @@ def checked(scenario: Scenario, seed: int) -> int:
 @pytest.mark.parametrize("intensity", ["field", "storm"])
 def test_nothing_is_broken_under_random_faults(intensity: str) -> None:
     scenario = load("fault-plan", [f"fault_plan.intensity={intensity}"])
-    for seed in SEEDS if intensity == "field" else SEEDS[:5]:
+    for seed in SEEDS if intensity == "field" else SEEDS[:2]:
         assert checked(scenario, seed) > 1000
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from agent.fault_parts import named, told
@@ -10,11 +12,12 @@ from sim.scenario_file import load
 from sim.summary import reduce, summarize, unmet
 from sim.trial import run_trial
 
+SEEDS = range(1, int(os.environ.get("COFIX_STORY_SEEDS", "1")) + 1)
 STORIES = ("clock-step", "kill-and-return", "late-packets", "lossy-radio", "partition-and-heal", "stale-burst")
 
 
 @pytest.mark.parametrize("name", STORIES)
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", SEEDS)
 def test_a_story_ends_as_it_should(name: str, seed: int) -> None:
     scenario = load(name)
     assert scenario.faults and scenario.expect
