@@ -6,6 +6,7 @@ lasts to the end.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
@@ -42,7 +43,7 @@ class TimedPart(Part):
 # -- links --------------------------------------------------------------------------------------------------
 
 
-class LinkFaultPart(TimedPart):
+class LinkFaultPart(TimedPart, ABC):
     """Which links: from `sources` to `destinations` (absent: everybody), and back unless `both_ways = false`."""
 
     sources: Ids | None = None
@@ -62,9 +63,9 @@ class LinkFaultPart(TimedPart):
         begin, end = self.span_ns(start_ns)
         return LinkFault(name, begin, end, self.links(), **self.suffered())
 
+    @abstractmethod
     def suffered(self) -> dict[str, Any]:
         """What is wrong, as keywords of `LinkFault`."""
-        raise NotImplementedError
 
 
 class PartitionPart(LinkFaultPart):

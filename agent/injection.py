@@ -52,7 +52,7 @@ class Injection:
                 rows.writerow(fate_row(record))
 
         self.links = LinkModel(part.links.settings(part.seed), self._table.state, log)
-        self._injector = LinkInjector(robot, self.links, true_ns, call_later, self._arrived, self._sent_at)
+        self._injector = LinkInjector(robot, self.links, true_ns, call_later, deliver, self._sent_at)
 
     async def open(self) -> None:
         """Learn from the world who hears whom."""
@@ -113,9 +113,6 @@ class Injection:
     def _sent_at(self, source: str, t_send_ns: int) -> int:
         """The true instant a sender's stamp stands for."""
         return self.clock(source).origin_ns(t_send_ns)
-
-    def _arrived(self, packet: Packet) -> None:
-        self._deliver(packet)
 
     def _forge(self, forger: Forger, after_ns: int) -> None:
         following = forger.next_ns(after_ns)

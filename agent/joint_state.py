@@ -90,16 +90,24 @@ class JointModel:
         return self.tracks.aged(replace(state, t_ns=t_ns, mean=found.mean, split=split), dt_s)
 
     def _within_a_turn(self, split: Split) -> Split:
-        """The split with an own heading no less sure than one that is unknown: its error is within half a turn."""
+        """The split with an own heading no less sure than an unknown one, which has nothing to do with the rest.
+
+        The wrapped error of such a heading is within half a turn, and as good as independent of what the unwrapped one
+        was correlated with.
+        """
         heading = self._settings.layout.heading
         assert heading is not None
-        variance = split.private[heading, heading] + split.shared[heading, heading]
+        parts = split.private, split.shared
+        variance = sum(float(part[heading, heading]) for part in parts)
         if variance <= UNKNOWN_RAD2:
             return split
-        scale = np.ones(len(split.private))
-        scale[heading] = math.sqrt(UNKNOWN_RAD2 / variance)
-        square = np.outer(scale, scale)
-        return Split(split.private * square, split.shared * square)
+        found = []
+        for part in parts:
+            lost, kept = part.copy(), float(part[heading, heading])
+            lost[heading, :] = lost[:, heading] = 0.0
+            lost[heading, heading] = kept * UNKNOWN_RAD2 / variance
+            found.append(lost)
+        return Split(*found)
 
     # -- own measurements -----------------------------------------------------------------------------------
 

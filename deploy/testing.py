@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from agent.config_file import ConfigError
 from agent.fault_parts import AnyFaultPart, check_faults, made
 from sim.engine import VirtualEngine
 from sim.metrics import StateTrace, nees
@@ -70,12 +71,19 @@ class Link:
         return self._fleet.links.get((*self._ends, kind), ("", 0.0))[1]
 
     def _set(self, kind: str, key: str, value: float) -> None:
-        links, here = self._fleet.links, (*self._ends, kind)
-        if here in links:
-            self._fleet.end(links.pop(here)[0])
-        if value:
-            a, b = self._ends
-            links[here] = (self._fleet.inject(kind, sources=[a], destinations=[b], **{key: float(value)}), value)
+        links, here, (a, b) = self._fleet.links, (*self._ends, kind), self._ends
+        before = links.pop(here, None)
+        # A value that is refused changes nothing.
+        try:
+            if value:
+                found = self._fleet.inject(kind, sources=[a], destinations=[b], **{key: float(value)})
+                links[here] = (found, value)
+        except ConfigError:
+            if before is not None:
+                links[here] = before
+            raise
+        if before is not None:
+            self._fleet.end(before[0])
 
 
 class Fleet(ABC):
@@ -179,10 +187,14 @@ class Fleet(ABC):
         return float(ratio.mean()) if len(ratio) else float("nan")
 
     def assert_consistent(self, limit: float = LIMIT, since_s: float = 0.0) -> None:
-        """No robot claims to know more than it does: its mean NEES per degree of freedom is at most `limit`."""
+        """No robot claims to know more than it does: its mean NEES per degree of freedom is at most `limit`.
+
+        Nothing is known of a robot that had no estimate all the time, which fails too.
+        """
         for robot in self.robots:
             anees = self.anees(robot, since_s)
-            assert not anees > limit, (
+            assert np.isfinite(anees), f"{robot} had no estimate between {since_s:g} and {self.t_s:g} s"
+            assert anees <= limit, (
                 f"{robot} is overconfident: ANEES {anees:.2f} is above {limit:g} after {self.t_s:g} s; replay it with "
                 f"seed {self.seed} of scenario '{self.scenario.name}'"
             )

@@ -246,7 +246,6 @@ class VirtualEngine:
             case Forged(forger):
                 forged = forger.packet(self._now)
                 if forged is not None:
-                    self._traffic["forged"] += 1
                     self._arrived(process, forged)
                 following = forger.next_ns(self._now)
                 if following is not None:

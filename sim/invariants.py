@@ -8,7 +8,7 @@ says what was broken, by whom, when, and how to see it again.
     sequence      numbers of messages sent rise by one, for each channel and destination
     books         what the endpoint received is what it delivered, hellos and refusals
     bounds        every buffer keeps within its stated bound
-    contacts      the last contact of a pair never becomes an earlier one within a life: none is applied twice
+    contacts      with factors, the last contact of a pair never becomes an earlier one within a life
     information   without information a pose gets no surer: motion keeps the volume of its uncertainty and adds noise
     split         private and shared parts of a covariance are positive semi-definite and add up to it
     counters      no counter falls, and there are only so many

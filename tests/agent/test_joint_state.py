@@ -167,3 +167,21 @@ def test_a_contradicted_track_ends_where_a_bearing_cannot_say_how_far_off_the_ta
     sensor = RelativeModel("bearing", subject._settings.layout, subject=CONSTANT_VELOCITY)
     after = subject.sighting(state, "t1", sensor, np.array([2.0]), 0.01 * np.eye(1)).state
     assert after.tracks == () and after.relayed == {} and after.doubted == {}
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.6, 0.95])
+def test_a_heading_that_is_nowhere_claims_no_more_than_its_wrapped_error(correlation: float) -> None:
+    """Whatever the unwrapped error was correlated with: what is claimed covers place and wrapped heading together."""
+    n = 3
+    cov = np.diag([4.0, 1.0, 36.0])
+    cov[0, 2] = cov[2, 0] = correlation * 12.0
+    settings = AgentSettings("r1", 0, np.zeros(n), cov)
+    state = JointModel(settings).moved(
+        JointState(0, np.zeros(n), Split(0.3 * cov, 0.7 * cov), (), ()), NS, np.zeros(4), np.zeros((4, 4))
+    )
+    random = np.random.default_rng(11)
+    error = random.multivariate_normal(np.zeros(n), cov, 200_000)
+    error[:, 2] = np.remainder(error[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+    spread = np.cov(error.T)
+    assert np.linalg.eigvalsh(state.cov - 0.98 * spread).min() > -0.02
+    assert float(np.trace(np.linalg.solve(state.cov, spread))) / n < 1.02

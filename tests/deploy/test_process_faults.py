@@ -166,10 +166,11 @@ def test_equal_packets_have_equal_fates(runs: tuple[Path, dict[str, Any], dict[s
     differing = 0
     for name in shared:
         a, b = virtual[name], processes[name]
-        if a["cause"] in timed or b["cause"] in timed:
+        # A receiver that has just started again does not know yet who is in reach.
+        if a["cause"] in timed or b["cause"] in timed or a["in_range"] != b["in_range"]:
             continue
         differing += any(a[key] != b[key] for key in ("cause", "lost", "delay_ns", "corrupted"))
-    assert differing <= 0.02 * len(shared)
+    assert differing == 0
     assert {row["cause"] for row in processes.values()} >= {"loss-1", "burst_loss-2", "partition-6", ""}
 
 

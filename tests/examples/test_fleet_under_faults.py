@@ -92,3 +92,23 @@ def test_an_overconfident_robot_is_found(fleet: FleetMaker) -> None:
     robots.run_for(5.0)
     with pytest.raises(AssertionError, match=r"overconfident.*seed 1"):
         robots.assert_consistent(limit=0.01)
+
+
+def test_a_robot_that_said_nothing_is_not_taken_for_honest(fleet: FleetMaker) -> None:
+    robots = fleet(OWN, QUIET)
+    robots.run_for(2.0)
+    robots.kill("r2")
+    robots.run_for(6.0)
+    with pytest.raises(AssertionError, match="r2 had no estimate"):
+        robots.assert_consistent(since_s=4.0)
+
+
+def test_a_value_that_is_refused_leaves_the_link_as_it_was(fleet: FleetMaker) -> None:
+    robots = fleet(OWN, QUIET)
+    link = robots.link("r1", "r2")
+    link.loss = 0.5
+    with pytest.raises(ConfigError, match="share"):
+        link.loss = 2.0
+    assert link.loss == 0.5
+    link.loss = 0.0
+    assert link.loss == 0.0

@@ -316,6 +316,22 @@ def test_a_clock_that_is_set_right_again_is_used_again() -> None:
     assert len(deliveries(a.receive(T0 + 12 * S, b.send(T0 + 12 * S, "r1", T0 + 12 * S, reply())))) == 1
 
 
+@pytest.mark.parametrize("step_ns", [-100 * S, -10 * S, 10 * S, 100 * S])
+def test_a_clock_that_is_set_by_more_than_the_horizon_is_soon_understood_again(step_ns: int) -> None:
+    a, b = endpoint("r1", clock_sigma_ns=50 * S), endpoint("r2", clock_sigma_ns=50 * S)
+    for k in range(5):
+        hello_round(a, b, T0 + k * S, 0, 2 * MS)
+    for k in range(5, 15):
+        hello_round(a, b, T0 + k * S, step_ns, 2 * MS)
+    for end, offset_ns, now_ns in ((a, step_ns, T0 + 15 * S), (b, -step_ns, T0 + 15 * S + step_ns)):
+        (peer,) = end.peers()
+        assert peer.up and peer.offset_ns == offset_ns and peer.clock_unusable is None
+        other = b if end is a else a
+        sent_ns = now_ns + offset_ns
+        packet = other.send(sent_ns, end.robot, sent_ns, reply())
+        assert len(deliveries(end.receive(now_ns, packet))) == 1
+
+
 def test_a_clock_that_is_set_again_and_again_is_named() -> None:
     a, b = endpoint("r1", clock_sigma_ns=50 * S), endpoint("r2", clock_sigma_ns=50 * S)
     for k in range(24):
