@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 from collections import Counter
 from dataclasses import replace
@@ -117,23 +118,26 @@ def _sample(
             next_row += 1
 
     span = world.steps * world.step_ns
-    try:
-        boundaries = (read_boundary(path, robot, unfinished=True) for path in paths)
-        for event, packed in chain.from_iterable(boundaries):
-            made = [unpack(data) for data in packed]
-            for peer in _contacts(event, made):
-                contacts.append(((event.t_ns - t0_ns) * 1e-9, robot, peer))
-            for effect in made:
-                if isinstance(effect, Publish):
-                    found = replace(effect.estimate, t_ns=clock.origin_ns(effect.estimate.t_ns))
-                    while latest is None and next_row * stride_ns + ahead < found.t_ns - t0_ns:
-                        next_row += 1  # Before the robot knew where it is.
-                    settle(found.t_ns - t0_ns)
-                    latest = found
-        if latest is not None:
-            settle(min(latest.t_ns - t0_ns + behind, span + 2 * ahead))
-    except RecordingError:
-        return
+    with contextlib.suppress(RecordingError):
+        for path in paths:
+            latest, born = None, False
+            for event, packed in read_boundary(path, robot, unfinished=True):
+                if not born:
+                    # What a life tells of the time before it is hindsight: nobody was there to ask.
+                    next_row = max(next_row, -int((t0_ns - clock.origin_ns(event.t_ns)) // stride_ns))
+                    born = True
+                made = [unpack(data) for data in packed]
+                for peer in _contacts(event, made):
+                    contacts.append(((event.t_ns - t0_ns) * 1e-9, robot, peer))
+                for effect in made:
+                    if isinstance(effect, Publish):
+                        found = replace(effect.estimate, t_ns=clock.origin_ns(effect.estimate.t_ns))
+                        while latest is None and next_row * stride_ns + ahead < found.t_ns - t0_ns:
+                            next_row += 1  # Before the robot knew where it is.
+                        settle(found.t_ns - t0_ns)
+                        latest = found
+            if latest is not None:
+                settle(min(latest.t_ns - t0_ns + behind, span + 2 * ahead))
 
 
 def _contacts(event: Event, effects: list[Effect]) -> list[str]:
