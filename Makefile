@@ -39,7 +39,7 @@ benchmark: setup
 # Thousands of seeds of random faults, invariants checked after every event. Results are kept in runs/check-long, and the same
 # command goes on where it stopped.
 check-long: setup
-	COFIX_STORY_SEEDS=20 $(BIN)/python -P -m pytest -n 2 tests/sim/test_stories.py
+	COFIX_THOROUGH=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -P -m pytest -n 2 tests/agent tests/sim tests/network
 	OPENBLAS_NUM_THREADS=1 $(BIN)/cofix montecarlo fault-plan --trials 2000 --check --out runs/check-long/field
 	OPENBLAS_NUM_THREADS=1 $(BIN)/cofix montecarlo fault-plan --trials 500 --check --set fault_plan.intensity=storm --out runs/check-long/storm
 

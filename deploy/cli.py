@@ -83,6 +83,7 @@ def parser() -> Parser:
         command.add_argument("--check", action="store_true", help="check invariants after every event (virtual time)")
         command.add_argument("--out", type=Path, help="run directory (default: runs/NAME-TIME)")
         command.add_argument("--json", action="store_true", help="print summary.json alone on standard output")
+        command.add_argument("--no-report", action="store_true", help="draw no report; `cofix report` does so later")
         command.add_argument("--duration", type=_seconds, metavar="S", help="play only so many seconds")
 
     run = commands.add_parser("run", help="run a scenario once; without a name, the demo")

@@ -192,7 +192,9 @@ def _conclude(
         )
         if series.failed:
             summary["failed"] = {str(seed): error for seed, error in series.failed.items()}
-        reports[series.name] = write_results(series.scenario, series.run_dir, summary, series.command)
+        reports[series.name] = write_results(
+            series.scenario, series.run_dir, summary, series.command, draw=not options.no_report
+        )
         summaries[series.name] = summary
         if not options.json:
             print_summary(summary, series.run_dir, reports[series.name])

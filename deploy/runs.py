@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
         exits=exits,
     )
     save_trace(run_dir, result.trace, result.contacts, world.landmarks, result.measured)
-    report = write_results(scenario, run_dir, summary, options.arguments)
+    report = write_results(scenario, run_dir, summary, options.arguments, draw=not options.no_report)
     if options.json:
         print(json.dumps(summary, allow_nan=False))
     else:
@@ -227,7 +227,9 @@ def _run_virtual(scenario: Scenario, options: argparse.Namespace, world: Any, ru
     return result
 
 
-def write_results(scenario: Scenario, run_dir: Path, summary: dict[str, Any], command: list[str]) -> Path | None:
+def write_results(
+    scenario: Scenario, run_dir: Path, summary: dict[str, Any], command: list[str], *, draw: bool = True
+) -> Path | None:
     """`command.txt`, `summary.json` and the report, whose path is returned; None, and why, when it can't be drawn.
 
     Conditions of the scenario the summary breaks are told too.
@@ -236,7 +238,7 @@ def write_results(scenario: Scenario, run_dir: Path, summary: dict[str, Any], co
     write_whole(run_dir / "summary.json", json.dumps(summary, indent=1, allow_nan=False) + "\n")
     report: Path | None = None
     try:
-        report = _report(run_dir, summary)
+        report = _report(run_dir, summary) if draw else None
     except ConfigError as error:
         print(f"cofix: no report: {error}", file=sys.stderr)
     for line in unmet(summary, scenario.expect):

@@ -13,6 +13,7 @@ from agent.estimation.motion import compose
 from agent.events import Event, Fix, Observation, Odometry, Received
 from agent.settings import NS, AgentSettings, LatenessSettings, LocalizationSettings
 from network.messages import Header, Message
+from tests.sizes import sized
 
 Array = NDArray[np.float64]
 
@@ -124,29 +125,28 @@ def test_overlapping_contacts_and_late_fixes_claim_their_true_covariance() -> No
     columns = []
     for source in sources:
         for column in (0, 1):
-            fleets = [overlapping(source, column, sign * SIZE) for sign in (1.0, -1.0)]
-            ahead, behind = (fleet.agents["r1"].filter.state.mean for fleet in fleets)
-            columns.append((ahead - behind)[:2] / (2.0 * SIZE))
+            ahead = overlapping(source, column, SIZE).agents["r1"].filter.state.mean
+            columns.append((ahead - still.filter.state.mean)[:2] / SIZE)
     errors = np.stack(columns, axis=1)
     assert np.abs(still.filter.state.cov[:2, :2] - errors @ errors.T).max() < 1e-4
 
 
 def test_a_dense_fleet_far_behind_stays_where_it_is() -> None:
-    """Ten robots, each ranging all others at once, with a second each way on the link (seed 1).
+    """Eight robots, each ranging all others at once, with a second each way on the link (seed 1).
 
-    Each robot has nine contacts of the same instants under way all the time. Updates that move the present alone
+    Each robot has seven contacts of the same instants under way all the time. Updates that move the present alone
     throw the fleet apart by tens of metres within a minute.
     """
     rng = np.random.default_rng(1)
     step_ns, sigma = NS // 5, np.array([0.1, 0.03, 0.01])
     noise = np.diag([sigma[0], sigma[1], 0.0, sigma[2]]) ** 2
-    names = [f"r{index}" for index in range(10)]
+    names = [f"r{index}" for index in range(8)]
     P = np.diag([0.25, 0.25, 0.0025])
     truth = {name: rng.uniform([-10, -10, -3], [10, 10, 3]) for name in names}
     starts = {name: (truth[name] + rng.multivariate_normal(np.zeros(3), P), P) for name in names}
     fleet = Fleet(starts, LocalizationSettings(form="split_joint", pair_timeout_ns=100 * NS), dict.fromkeys(names, NS))
     squares = []
-    for k in range(1, 201):
+    for k in range(1, sized(100, 200) + 1):
         now_ns = k * step_ns
         fleet.deliver(now_ns - 1)
         for name in names:
@@ -162,7 +162,7 @@ def test_a_dense_fleet_far_behind_stays_where_it_is() -> None:
                 z = np.array([np.hypot(*(truth[peer] - truth[name])[:2]) + rng.normal() * 0.1])
                 fleet.handle(name, Observation(now_ns, now_ns, "range", peer, z, np.eye(1) * 0.01, "range"))
         squares += [float(np.sum((fleet.agents[name].filter.state.mean - truth[name])[:2] ** 2)) for name in names]
-    assert sum(agent.counters["pair.applied_initiator"] for agent in fleet.agents.values()) > 400
+    assert sum(agent.counters["pair.applied_initiator"] for agent in fleet.agents.values()) > 200
     assert np.sqrt(np.mean(squares)) < 1.5
     for agent in fleet.agents.values():
         np.linalg.cholesky(agent.filter.state.cov)

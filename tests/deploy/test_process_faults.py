@@ -104,7 +104,7 @@ def run(folder: Path, out: str, *options: str) -> dict[str, Any]:
     path = folder / "faults.toml"
     path.write_text(text)
     done = subprocess.run(
-        [*COFIX, "run", str(path), "--seed", "4", "--json", "--out", str(folder / out), *options],
+        [*COFIX, "run", str(path), "--seed", "4", "--json", "--no-report", "--out", str(folder / out), *options],
         capture_output=True,
         text=True,
         timeout=120,

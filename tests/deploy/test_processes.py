@@ -157,7 +157,7 @@ def test_processes_agree_with_virtual_time(tmp_path: Path) -> None:
     assert status == 0, said
     assert real is not None
     assert_nothing_left(tmp_path, members)
-    status, virtual, said = Run(tmp_path, "virtual").finish()
+    status, virtual, said = Run(tmp_path, "virtual", "--no-report").finish()
     assert status == 0, said
     assert virtual is not None
     assert real["exit"] == {"r1": 0, "r2": 0}
@@ -191,7 +191,7 @@ def test_processes_agree_with_virtual_time(tmp_path: Path) -> None:
 
 
 def test_a_killed_agent_is_told_and_the_others_finish(tmp_path: Path) -> None:
-    run = Run(tmp_path, "killed", "--runtime", "processes", "--speed", "4")
+    run = Run(tmp_path, "killed", "--runtime", "processes", "--speed", "4", "--no-report", "--duration", "25")
     members = run.members()
     run.wait_until_played()
     os.kill(members["r2"], signal.SIGKILL)

@@ -9,6 +9,7 @@ import pytest
 from sim.montecarlo import run_trials
 from sim.scenario_file import load
 from sim.summary import summarize
+from tests.sizes import sized
 
 SCENARIO = """
 version = 1
@@ -75,7 +76,7 @@ id = "A3"
 position = [0.0, 15.0]
 """
 
-TRIALS, SEED = 12, 30
+TRIALS, SEED = sized(6, 12), 30
 
 
 @pytest.mark.parametrize(("model", "acceleration"), [("damped_velocity", "0.1"), ("constant_velocity", "0.01")])

@@ -13,6 +13,7 @@ from sim.metrics import StateTrace
 from sim.scenario import Scenario
 from sim.scenario_file import load
 from sim.trial import run_trial
+from tests.sizes import sized
 
 
 def with_faults(*faults: dict[str, Any], **change: Any) -> Scenario:
@@ -91,7 +92,7 @@ def test_who_comes_back_claims_no_more_than_it_knows(fault: str) -> None:
     how = {"state": "lost"} if fault == "crash" else {}
     base = with_faults({"kind": fault, "robot": "r5", "at_s": 8.0, "for_s": 8.0, **how})
     own, others = [], []
-    for seed in range(1, 4):
+    for seed in range(1, sized(2, 6) + 1):
         result = run_trial(base, seed)
         own.append(float(np.nanmean(nees(result.trace.robots["r5"])[result.trace.t_s > 16.0])))
         others += [float(np.nanmean(nees(result.trace.robots[name]))) for name in ("r1", "r2", "r3", "r4")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -21,8 +20,9 @@ from sim.invariants import InvariantBreach, InvariantChecker
 from sim.scenario import Scenario
 from sim.scenario_file import load
 from sim.trial import open_world, run_trial
+from tests.sizes import sized
 
-SEEDS = range(1, int(os.environ.get("COFIX_FAULT_SEEDS", "20")) + 1)
+SEEDS = range(1, sized(6, 40) + 1)
 
 
 def checked(scenario: Scenario, seed: int) -> int:

@@ -8,10 +8,11 @@ import pytest
 from sim.metrics import reduce_trial
 from sim.scenario_file import load
 from sim.trial import run_trial
+from tests.sizes import THOROUGH, sized
 
 WINDOW = (20.0, 60.0)
 DENSE = [f"duration_s={WINDOW[1]}", f"window_s=[{WINDOW[0]}, {WINDOW[1]}]", "localization.kind=replica"]
-SEEDS = range(1, 4)
+SEEDS = range(1, sized(2, 4) + 1)
 
 
 @pytest.mark.parametrize(
@@ -57,7 +58,7 @@ def lossless() -> tuple[dict[str, float], float]:
     return played(0.0)
 
 
-@pytest.mark.parametrize("loss", [0.3, 0.6])
+@pytest.mark.parametrize("loss", [0.3, 0.6] if THOROUGH else [0.6])
 def test_a_robot_that_misses_much_knows_less_and_says_so(loss: float, lossless: tuple[dict[str, float], float]) -> None:
     """The same seeds without loss are the measure, since linearization and few seeds make it differ from 1.
 

@@ -16,10 +16,11 @@ from sim.scenario_checks import check
 from sim.summary import reduce, summarize
 from sim.trial import run_trial
 from tests.assertions import anees_band
+from tests.sizes import sized
 
 Array = NDArray[np.float64]
 
-SEEDS = range(1, 13)
+SEEDS = range(1, sized(8, 24) + 1)
 POLAR = {"kind": "range_bearing", "sigma_m": 0.2, "sigma_rad": 0.03}
 FORMS = ("split_joint", "safe")
 

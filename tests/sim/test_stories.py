@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import pytest
 
 from agent.fault_parts import named, told
@@ -11,8 +9,9 @@ from sim.invariants import InvariantChecker
 from sim.scenario_file import load
 from sim.summary import reduce, summarize, unmet
 from sim.trial import run_trial
+from tests.sizes import sized
 
-SEEDS = range(1, int(os.environ.get("COFIX_STORY_SEEDS", "1")) + 1)
+SEEDS = range(1, sized(1, 20) + 1)
 STORIES = ("clock-step", "kill-and-return", "late-packets", "lossy-radio", "partition-and-heal", "stale-burst")
 
 
