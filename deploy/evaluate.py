@@ -15,7 +15,8 @@ from agent.effects import Effect, Publish, Send
 from agent.events import Event, Received
 from agent.fault_parts import BiasPart, ClockDriftPart, ClockStepPart, DropoutPart, OutliersPart, SilencePart
 from agent.recording import RecordingError, merge, read_boundary, unpack
-from deploy.launch import Outcome, life_files
+from deploy.agent_files import life_files
+from deploy.launch import Outcome
 from network.links import FATE_COLUMNS
 from network.messages import PairReply, ReplyStatus
 from sim.agents import autopilot_fix

@@ -1,0 +1,96 @@
+"""The files of the agents of a run: what each is started with, and what each of its lives leaves behind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from agent.estimation.motion import LAYOUTS
+from network.zenoh_transport import link_pair
+from sim.agents import agent_tables, autopilot_fix, odometry_table, table
+from sim.fault_plan import trial_faults
+from sim.host import HostPlan
+from sim.scenario import RobotPart, Scenario, sensor_kind
+from sim.world import World
+
+# What the scheduling of one computer costs, in wall time: data of an instant are waited for so long, and stamps
+# that passed through TIMESYNC are off by so much.
+SETTLE_WALL_S = 0.015
+STAMP_WALL_S = 0.0015
+LEASE_MS, LEASE_PER_ROBOT_MS = 1_000, 250
+"""Many processes that start on one computer are slow at first: links that are given up too soon are opened again and
+again, and with forty of them that takes all the time there is."""
+
+
+def agent_file(
+    scenario: Scenario,
+    world: World,
+    robot: RobotPart,
+    seed: int,
+    speed: float,
+    plan: HostPlan,
+    run_dir: Path,
+    state_dir: Path,
+    ports: dict[str, int],
+) -> dict[str, Any]:
+    """The file of one agent: what is common to all runtimes, plus endpoints, clock and injection."""
+    tables = agent_tables(scenario, world, robot)
+    endpoints = {name: list(link_pair("127.0.0.1", port)) for name, port in ports.items()}
+    lateness = tables["lateness"]
+    lateness["settle_s"] = max(lateness["settle_s"], SETTLE_WALL_S * speed)
+    lateness["tolerance_s"] = max(lateness["tolerance_s"], STAMP_WALL_S * speed)
+    fix = autopilot_fix(robot)
+    mavlink: dict[str, Any] = {
+        "endpoint": f"udpin:127.0.0.1:{plan.mavlink_ports[robot.id]}",
+        "simulated": True,
+        "odometry_source": "odometry",
+        "odometry": odometry_table(scenario, robot),
+        "rate_hz": 1.0 / scenario.step_s,
+    }
+    if fix is not None:
+        sensor = robot.sensors[fix]
+        mavlink |= {"fixes": ["position"], "fix_sigma_m": sensor.sigma_m, "fix_interval_s": 0.0}
+        if sensor_kind(fix, sensor) == "pose":
+            mavlink |= {"fixes": [*mavlink["fixes"], "heading"], "fix_sigma_rad": sensor.sigma_rad}
+        if LAYOUTS[robot.model].altitude is not None:
+            sigma_m = sensor.sigma_z_m or sensor.sigma_m
+            mavlink |= {"fixes": [*mavlink["fixes"], "altitude"], "fix_sigma_altitude_m": sigma_m}
+    return tables | {
+        "clock": {"source": "run", "speed": speed},
+        "lateness": lateness,
+        "zenoh": {
+            "listen": endpoints[robot.id],
+            "peers": [{"id": name, "endpoints": value} for name, value in endpoints.items() if name != robot.id],
+            "lease_ms": max(LEASE_MS, LEASE_PER_ROBOT_MS * len(endpoints)),
+        },
+        "mavlink": mavlink,
+        "injection": {
+            "seed": seed,
+            "links": table(scenario.links),
+            "faults": [
+                table(fault.model_copy(update={"id": name}))
+                for name, fault in trial_faults(scenario, seed).items()
+                if fault.level in ("link", "forgery", "clock")
+            ],
+            "table": plan.link_endpoint,
+            "fate_log": str(life_file(run_dir, robot.id, 1, "fates.csv")),
+        },
+        "state_dir": str(state_dir / robot.id),
+        "recording": str(life_file(run_dir, robot.id, 1, "mcap")),
+        "control_socket": plan.control_socket,
+    }
+
+
+def life_file(run_dir: Path, robot: str, life: int, ending: str) -> Path:
+    """What a life of an agent leaves: the recording or the fate log of its first one, or of a later one."""
+    number = "" if life == 1 else f".{life}"
+    return run_dir / "agents" / f"{robot}{number}.{ending}"
+
+
+def life_files(run_dir: Path, robot: str, ending: str) -> list[Path]:
+    """Of all its lives, in order."""
+    found, life = [], 1
+    while (path := life_file(run_dir, robot, life, ending)).exists():
+        found.append(path)
+        life += 1
+    return found
