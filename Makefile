@@ -28,8 +28,8 @@ check: setup
 
 # Processes and links of real time come after the rest, alone.
 unit: setup
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -P -m pytest -n 2 --dist loadfile tests --ignore tests/deploy --ignore tests/docs --ignore tests/examples
-	$(BIN)/python -P -m pytest tests/deploy tests/docs tests/examples
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -P -m pytest -n 2 --dist loadfile -m "not realtime" tests
+	$(BIN)/python -P -m pytest -m realtime tests
 
 # Ratios against public libraries, speed of fleets, memory; measured, never asserted by tests.
 benchmark: setup

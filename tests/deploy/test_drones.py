@@ -8,9 +8,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from agent.events import Fix, Observation, Odometry
 from agent.recording import read_agents, read_boundary
+
+pytestmark = pytest.mark.realtime
 
 SCENARIO = """
 version = 1

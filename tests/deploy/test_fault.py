@@ -23,6 +23,8 @@ from sim.scenario import Scenario
 from sim.scenario_file import load
 from sim.store import load_trace
 
+pytestmark = pytest.mark.realtime
+
 COFIX = (sys.executable, "-P", "-m", "deploy.cli")
 
 WORDS: list[tuple[str, dict[str, Any]]] = [
@@ -217,7 +219,7 @@ def test_a_run_that_goes_on_is_broken_and_healed_by_hand(tmp_path: Path) -> None
         return done.stdout.partition(":")[0]
 
     run = subprocess.Popen(
-        [*COFIX, "run", "trio.toml", *"--runtime processes --speed 4 --seed 3 --json --no-report --out run".split()],
+        [*COFIX, "run", "trio.toml", "--runtime", "processes", "--speed", "4", "--seed", "3", "--json", "--out", "run"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -17,6 +17,8 @@ from agent.recording import replay
 from sim.metrics import nees
 from sim.store import load_trace
 
+pytestmark = pytest.mark.realtime
+
 COFIX = (sys.executable, "-P", "-m", "deploy.cli")
 
 FAULTS = """

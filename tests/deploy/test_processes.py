@@ -16,6 +16,8 @@ import pytest
 
 from sim.store import load_trace
 
+pytestmark = pytest.mark.realtime
+
 SCENARIO = """
 version = 1
 name = "pair"

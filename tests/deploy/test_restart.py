@@ -9,10 +9,13 @@ import time
 from pathlib import Path
 
 import msgpack
+import pytest
 
 from agent.recording import Life, read_lives, replay
 from agent.state_file import FILE, REFUSED, Found, StateFile
 from tests.desk_agent import ANCHORS, DeskAgent
+
+pytestmark = pytest.mark.realtime
 
 PLACE = (1.5, 2.0)
 

@@ -13,6 +13,8 @@ import pytest
 from deploy.cli import parser
 from sim.scenario_file import bundled, load
 
+pytestmark = pytest.mark.realtime
+
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
 PLACEHOLDERS = {"NAME-TIME": "demo-1", "CONFIG": "r1.toml", "FOLDER_OF_MRCLAM_Dataset7": "folder"}

@@ -39,6 +39,8 @@ from network.wire_fields import REASONS
 from sim.scenario import Scenario, StartPart
 from tests.desk_agent import desk_agent
 
+pytestmark = pytest.mark.realtime
+
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "docs" / "interfaces.md").read_text()
 COFIX = (sys.executable, "-P", "-m", "deploy.cli")

@@ -25,6 +25,8 @@ from agent.recording import read_boundary, unpack
 from agent.sensor_input import decode
 from tests.desk_agent import ANCHORS, DeskAgent, desk_agent
 
+pytestmark = pytest.mark.realtime
+
 DRIVER = Path(__file__).resolve().parents[2] / "examples" / "uwb_driver.py"
 PLACE = (1.0, 2.0)
 
