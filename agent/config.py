@@ -27,6 +27,7 @@ from agent.config_parts import (
     MAX_TEAM,
     CalibrationPart,
     CoastPart,
+    HealthPart,
     IntrinsicsPart,
     LandmarkPart,
     LatenessPart,
@@ -161,6 +162,7 @@ class AgentConfig(Part):
     localization: LocalizationPart = LocalizationPart()
     tracking: TrackingPart = TrackingPart()
     lateness: LatenessPart = LatenessPart()
+    health: HealthPart = HealthPart()
     coast: CoastPart = CoastPart()
     network: NetworkPart = NetworkPart()
     state: StatePart = StatePart()
@@ -198,6 +200,7 @@ class AgentConfig(Part):
             one_way_sensors=tuple(name for name, part in sorted(self.sensors.items()) if not part.two_way),
             localization=self.localization.settings(),
             lateness=self.lateness.settings(),
+            health=self.health.settings(self.localization.form),
             coast=self.coast.settings(),
             track=self.tracking.kind != "none",
             team=tuple(member.settings() for member in self.team),

@@ -22,6 +22,7 @@ from agent.estimation.observation import Intrinsics
 from agent.estimation.odometry import OdometryNoise
 from agent.settings import (
     CoastSettings,
+    HealthSettings,
     LatenessSettings,
     LocalizationSettings,
     TeamMember,
@@ -110,6 +111,22 @@ class LatenessPart(Part):
             odometry_wait_ns=nanoseconds(self.odometry_wait_s),
             clock_sigma_ns=nanoseconds(self.clock_sigma_s),
         )
+
+
+class HealthPart(Part):
+    window: Annotated[int, Field(ge=2, le=1000)] = 8
+    suspect_nis: Annotated[float, Field(gt=1.0, allow_inf_nan=False)] = 6.0
+    gate_nis: Annotated[float, Field(gt=1.0, allow_inf_nan=False)] = 12.0
+    readmit_after: Annotated[int, Field(ge=1, le=1000)] = 8
+
+    def settings(self, form: str) -> HealthSettings:
+        """The form `published` is as published, and judges nobody. Raises `ConfigError`."""
+        if self.gate_nis < self.suspect_nis:
+            raise ConfigError(
+                f"health.gate_nis = {self.gate_nis:g} is below health.suspect_nis = {self.suspect_nis:g}, and nobody"
+                " would ever be quarantined; make it at least as large"
+            )
+        return HealthSettings(enabled=form != "published", **self.model_dump())
 
 
 class CoastPart(Part):

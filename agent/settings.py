@@ -68,6 +68,23 @@ class LatenessSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class HealthSettings:
+    """When a peer's contacts are no longer used, and when they are again; see `agent.health`.
+
+    window         contacts that are looked at
+    suspect_nis    mean normalized innovation squared per degree of freedom at which a peer is quarantined
+    gate_nis       a single contact beyond it is not used, and counts as much
+    readmit_after  consistent contacts in a row after which a peer is re-admitted
+    """
+
+    enabled: bool = True
+    window: int = 8
+    suspect_nis: float = 6.0
+    gate_nis: float = 12.0
+    readmit_after: int = 8
+
+
+@dataclass(frozen=True, slots=True)
 class CoastSettings:
     """What the robot may do while its odometry is silent: unknown constant speed and yaw rate (1 sigma)."""
 
@@ -133,6 +150,7 @@ class AgentSettings:
     localization: LocalizationSettings = field(default_factory=LocalizationSettings)
     lateness: LatenessSettings = field(default_factory=LatenessSettings)
     coast: CoastSettings = field(default_factory=CoastSettings)
+    health: HealthSettings = HealthSettings()
     track: bool = True
     team: tuple[TeamMember, ...] = ()
     track_end: TrackEnd = TrackEnd()

@@ -24,6 +24,7 @@ from agent.config_parts import (
     CoastPart,
     ControlNoisePart,
     ControlPart,
+    HealthPart,
     IntrinsicsPart,
     LandmarkPart,
     LatenessPart,
@@ -242,6 +243,7 @@ class Scenario(Part):
     tracking: TrackingPart = TrackingPart()
     lateness: LatenessPart = LatenessPart()
     coast: CoastPart = CoastPart()
+    health: HealthPart = HealthPart()
     network: NetworkPart = NetworkPart()
     state: StatePart = StatePart()
     links: LinksPart = LinksPart()

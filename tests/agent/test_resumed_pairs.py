@@ -18,7 +18,7 @@ from agent.events import LinkChange, Observation, Received
 from agent.settings import NS, CoastSettings
 from network.messages import Header, Message, PairReply, PairRequest
 from tests.agent.courier import FIRST, SECOND, Letter, Pair
-from tests.agent.test_pair_interleavings import FATES, OTHER, STARTS, WHO, Story, assert_books_exact
+from tests.agent.test_pair_interleavings import FATES, OTHER, STARTS, WHO, Story, Unwilling, assert_books_exact
 
 Array = NDArray[np.float64]
 
@@ -113,6 +113,34 @@ def test_the_books_stay_exact_through_a_kill(first: str, again: str, robot: str)
         assert_books_exact(story, note)
         for agent in story.pair.agents.values():
             assert agent.counters["pair.restarts"] == agent.counters["pair.fallback"] == 0, note
+
+
+@pytest.mark.parametrize("order", ["refusal first", "repetition first"])
+def test_a_contact_refused_as_inconsistent_stays_refused_through_a_kill(order: str) -> None:
+    """The refusal is late, and the request is repeated to a life that would use it, when the line may be gone."""
+    story = KilledStory(("now", "now", "now", "late"), timeout_s=1.0)
+    story.step()
+    story.contact((FIRST,))
+    story.step()
+    story.step()
+    responder = story.pair.agents[SECOND]
+    responder.filter._pairs._health = Unwilling(SECOND, frozenset({(SECOND, 3)}))  # type: ignore[attr-defined]
+    story.contact((FIRST,))
+    assert responder.counters["pair.request_apply"] == 2 and len(story.applied) == 2
+    again = story.step()
+    assert [letter.destination for letter in again] == [SECOND]
+    story.killed(SECOND)
+    answers = story._handed(again[0]) if order == "repetition first" else []
+    story.late()
+    for letter in answers or story._handed(again[0]):
+        story.travel([letter])
+    assert story.pair.agents[SECOND].counters["pair.request_answer_inconsistent"] == 1
+    assert len(story.applied) == 2
+    story.learn()
+    story.step()
+    story.contact((FIRST,))
+    assert len(story.applied) == 4
+    assert_books_exact(story, order)
 
 
 def test_a_file_older_than_the_last_message_is_noticed_by_the_pair() -> None:
