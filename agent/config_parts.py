@@ -26,6 +26,7 @@ from agent.settings import (
     LatenessSettings,
     LocalizationSettings,
     TeamMember,
+    UnsafeSettings,
     nanoseconds,
 )
 from network.endpoint import EndpointSettings
@@ -149,13 +150,16 @@ class NetworkPart(Part):
     hello_period_s: Positive = 0.5
     silent_after_s: Positive = 3.0
 
-    def settings(self, lateness: LatenessPart) -> EndpointSettings:
+    def settings(self, lateness: LatenessPart, unsafe: UnsafeSettings) -> EndpointSettings:
         return EndpointSettings(
             hello_period_ns=nanoseconds(self.hello_period_s),
             silent_after_ns=nanoseconds(self.silent_after_s),
             horizon_ns=nanoseconds(lateness.horizon_s),
             clock_sigma_ns=nanoseconds(lateness.clock_sigma_s),
             max_clock_sigma_ns=nanoseconds(lateness.max_clock_sigma_s),
+            accept_duplicates=unsafe.accept_duplicates,
+            accept_stale=unsafe.accept_stale,
+            trust_clocks=unsafe.trust_clocks,
         )
 
 

@@ -175,6 +175,7 @@ class Agent:
             "form_reason": why,
             "waiting": len(self._timeline),
             "pairs": {peer: epoch.t_meas_ns for peer, epoch in self.filter.contacts().items()},
+            "unsafe": self.settings.unsafe.named(),
             "health": self.health.status(self.now_ns),
             "counters": dict(self.counters),
         }
@@ -217,7 +218,7 @@ class Agent:
     def _receive(self, event: Received, effects: list[Effect]) -> None:
         body = event.message.body
         if isinstance(body, PairRequest | SplitRequest | StartRequest):
-            self._queue(Item(self.filter.instant_ns(event), Phase.PAIR, event.message.header.source, event))
+            self._queue(Item(self._asked_ns(event), Phase.PAIR, event.message.header.source, event))
         elif isinstance(body, PairReply | SplitReply):
             self._drain(effects)
             self.filter.replied(event.message.header.source, body)
@@ -225,6 +226,12 @@ class Agent:
         else:
             self._drain(effects)
             self.filter.heard(event, effects)
+
+    def _asked_ns(self, event: Received) -> int:
+        """The instant that a peer's request refers to, on the own clock."""
+        t_ns, unsafe = self.filter.instant_ns(event), self.settings.unsafe
+        gone = t_ns < self.filter.t_ns - self.settings.lateness.horizon_ns
+        return max(t_ns, self.filter.t_ns) if unsafe.use_late_as_new or (unsafe.accept_stale and gone) else t_ns
 
     # -- time -----------------------------------------------------------------------------------------------
 

@@ -6,8 +6,8 @@ measurements, before any cap. A contact above `gate_nis` is not used, whoever it
 contacts the NIS are summed, each counted as `gate_nis` at most, so that no few outliers decide; at `window *
 suspect_nis` the peer is quarantined, after four contacts at least by default. For independent innovations of one degree
 of freedom the sum is chi-squared with `window` degrees of freedom, or less: with 8 and 6.0 a contact gives a false
-alarm with probability 1e-7. Innovations of a pair that share one error are not independent; at worst, all of them the same,
-it is that of one normal variable beyond sqrt(6) sigmas, 1.4e-2 for each such error.
+alarm with probability 1e-7. Innovations of a pair that share one error are not independent; at worst, all of them the
+same, it is that of one normal variable beyond sqrt(6) sigmas, 1.4e-2 for each such error.
 
 A quarantined peer's contacts are exchanged and evaluated as before, but not used. It is re-admitted after
 `readmit_after` contacts in a row none of which exceeds `suspect_nis` and whose mean is half of that at most.

@@ -256,11 +256,13 @@ class JointModel:
         H_own, H_other = (met.H_i, met.H_j) if own_observed else (met.H_j, met.H_i)
         k = len(told.mean)
         private = told.private if trusted and told.private is not None else np.zeros((k, k))
-        other, recurring = Split(private, told.cov - private), RECURRING * symmetrize(met.residual)
+        own, other, recurring = state.split, Split(private, told.cov - private), RECURRING * symmetrize(met.residual)
+        if self._settings.localization.correlation == "ignored":
+            own, other = (Split(cov, np.zeros_like(cov)) for cov in (state.cov, told.cov))
         heading = self._settings.layout.heading
         lost = heading is not None and state.cov[heading, heading] > INDIFFERENT_RAD2
         indifferent = (heading,) if lost and heading is not None else ()
-        update = update_from_peer(state.split, other, H_own, H_other, met.R, recurring, indifferent)
+        update = update_from_peer(own, other, H_own, H_other, met.R, recurring, indifferent)
         if update is not None:
             state = self._shifted(state, update.K @ met.nu, update.split)
             ages = zip(told.targets, told.ages_ns)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 import numpy as np
@@ -85,6 +85,32 @@ class HealthSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class UnsafeSettings:
+    """Protections that are switched off, each by its own switch; for demonstrations.
+
+    ignore_correlation   peers' errors count as independent of the own one: the same information is used again and again
+    ignore_gaps          a robot whose odometry is silent, or that was down, has not moved
+    trust_liars          no contact is refused for its innovation, and nobody quarantined
+    trust_clocks         peers' clocks count as right, whatever is measured of them
+    accept_duplicates    packets are taken as often as they arrive, and without factors contacts are used as often
+    accept_stale         messages of any age are taken; of what the past no longer reaches back to, as if of now
+    use_late_as_new      peers' measurements are used as if made when they arrive
+    """
+
+    ignore_correlation: bool = False
+    ignore_gaps: bool = False
+    trust_liars: bool = False
+    trust_clocks: bool = False
+    accept_duplicates: bool = False
+    accept_stale: bool = False
+    use_late_as_new: bool = False
+
+    def named(self) -> list[str]:
+        """The switches that are on."""
+        return [item.name for item in fields(self) if getattr(self, item.name)]
+
+
+@dataclass(frozen=True, slots=True)
 class CoastSettings:
     """What the robot may do while its odometry is silent: unknown constant speed and yaw rate (1 sigma)."""
 
@@ -151,6 +177,7 @@ class AgentSettings:
     lateness: LatenessSettings = field(default_factory=LatenessSettings)
     coast: CoastSettings = field(default_factory=CoastSettings)
     health: HealthSettings = HealthSettings()
+    unsafe: UnsafeSettings = UnsafeSettings()
     track: bool = True
     team: tuple[TeamMember, ...] = ()
     track_end: TrackEnd = TrackEnd()

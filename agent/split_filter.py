@@ -276,7 +276,7 @@ class SplitFilter:
             self._counters["pair.malformed"] += 1
             return
         exchange, epoch = self._exchange(peer), request.epoch
-        if exchange.known(epoch):
+        if exchange.known(epoch) and not self._settings.unsafe.accept_duplicates:
             self._counters["pair.request_repeat_reply"] += 1
             reply = exchange.reply_to(epoch)
             if reply is not None:
