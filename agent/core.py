@@ -96,7 +96,7 @@ class Agent:
     def _persist(self, effects: list[Effect], judged: bool) -> None:
         """Have the state kept: before messages that it must not be older than, with new verdicts, from time to time."""
         first = next((index for index, effect in enumerate(effects) if isinstance(effect, Send)), None)
-        ahead = first is not None and self.filter.keeps_factors
+        ahead = first is not None and self.filter.keeps_factors and not self.settings.unsafe.send_before_saving
         due = self.now_ns >= self._persist_due_ns and self.filter.revision is not self._persisted
         if not ahead and not due and not judged:
             return

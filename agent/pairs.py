@@ -241,6 +241,9 @@ class Pairs:
 
         No peer may inflate us again within `restart_interval_ns`; its correlation counts as unknown until then.
         """
+        if self._settings.unsafe.trust_restarts:
+            self._counters["pair.restarts"] += 1
+            return state.forgotten(peer, known=True)
         last = self._inflated_ns.get(peer)
         if last is not None and now_ns - last < self._settings.localization.restart_interval_ns:
             self._counters["pair.restart_refused"] += 1

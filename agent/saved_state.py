@@ -152,7 +152,7 @@ def begun_again(settings: AgentSettings) -> AgentSettings:
     whole belief counts as shared. A fix, or a place that a peer tells, is new information, and needs nothing.
     """
     localization = settings.localization
-    if settings.source != "survey" or localization.kind == "replica":
+    if settings.source != "survey" or localization.kind == "replica" or settings.unsafe.trust_restarts:
         return settings
     if localization.form in ("auto", "split_joint"):
         return replace(settings, shared=settings.cov, found_out=True)

@@ -95,6 +95,8 @@ class UnsafeSettings:
     accept_duplicates    packets are taken as often as they arrive, and without factors contacts are used as often
     accept_stale         messages of any age are taken; of what the past no longer reaches back to, as if of now
     use_late_as_new      peers' measurements are used as if made when they arrive
+    trust_restarts       who begins anew, or has lost a correlation, counts as independent; no covariance is doubled
+    send_before_saving   messages of contacts do not wait for the state file that they rely on
     """
 
     ignore_correlation: bool = False
@@ -104,6 +106,8 @@ class UnsafeSettings:
     accept_duplicates: bool = False
     accept_stale: bool = False
     use_late_as_new: bool = False
+    trust_restarts: bool = False
+    send_before_saving: bool = False
 
     def named(self) -> list[str]:
         """The switches that are on."""

@@ -14,6 +14,8 @@ class UnsafePart(Part):
     accept_duplicates: bool = False
     accept_stale: bool = False
     use_late_as_new: bool = False
+    trust_restarts: bool = False
+    send_before_saving: bool = False
 
     def settings(self) -> UnsafeSettings:
         return UnsafeSettings(**self.model_dump())

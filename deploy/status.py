@@ -162,7 +162,9 @@ class LiveTable:
         title = f"{self._scenario.name}  {played:.0f} / {self._scenario.duration_s:.0f} s  at {self._speed:g} x"
         links = self._scenario.links.model_dump(exclude_defaults=True)
         injected = ", ".join([*(f"{name} {value:g}" for name, value in links.items()), *launcher.injected()])
-        notes = [f"injected: {injected}"] if injected else []
+        unsafe = self._scenario.unsafe.settings().named()
+        notes = [f"UNSAFE: {', '.join(unsafe)}"] if unsafe else []
+        notes += [f"injected: {injected}"] if injected else []
         for name, running in sorted(launcher.members.items()):
             notes += [f"{name}: {reason}" for reason in running.status.get("health", {}).get("reasons", [])]
         table = Table(
@@ -267,6 +269,8 @@ def print_summary(summary: dict[str, Any], run_dir: Path, report: Path | None) -
         console.print("rejected: " + ", ".join(f"{name} {count}" for name, count in summary["rejected"].items()))
     if summary["faults"]:
         console.print("injected: " + ", ".join(summary["faults"]))
+    if summary["unsafe"]:
+        console.print("[red]UNSAFE: protections are off: " + ", ".join(summary["unsafe"]) + "[/red]")
     if report is not None:
         console.print(f"report: {report}", soft_wrap=True)
     console.print(f"run directory: {run_dir}", soft_wrap=True)

@@ -78,6 +78,7 @@ def summarize(
         "quarantines": {"begun": begun, "ended": ended, "open": begun - ended},
         "covariance_repairs": sum(item["repairs"] for item in reduced),
         "faults": faults(scenario, seed if len(reduced) == 1 else None),
+        "unsafe": scenario.unsafe.settings().named(),
         "exit": exits if exits is not None else {robot.id: 0 for robot in scenario.robots},
         "timing": timing,
     }

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from agent.core import Agent
 from agent.effects import Persist, Send
 from agent.events import LinkChange, Observation, Received
-from agent.settings import NS, CoastSettings
+from agent.saved_state import begun_again
+from agent.settings import NS, CoastSettings, UnsafeSettings
 from network.messages import Header, Message, PairReply, PairRequest
 from tests.agent.courier import FIRST, SECOND, Letter, Pair
 from tests.agent.test_pair_interleavings import FATES, OTHER, STARTS, WHO, Story, Unwilling, assert_books_exact
@@ -197,3 +198,23 @@ def test_fifty_starts_in_a_minute_inflate_a_peer_no_further() -> None:
         # It meets the peer each time: there is something to forget.
         peer.filter.state = peer.filter.state.with_base(FIRST, peer.filter.state.pair(FIRST).base, np.eye(3), np.eye(3))
     assert float(np.max(np.diagonal(peer.filter.state.cov) / np.diagonal(before))) <= 2.0 + 1e-9
+
+
+def test_who_does_not_save_first_or_trusts_restarts_is_not_protected() -> None:
+    """What the switches of `[unsafe]` take away: the state before the message, and the bound of a new life."""
+    pair = Pair(STARTS)
+    unsafe = UnsafeSettings(send_before_saving=True, trust_restarts=True)
+    pair.agents = {name: Agent(replace(agent.settings, unsafe=unsafe)) for name, agent in pair.agents.items()}
+    for name in STARTS:
+        pair.odometry(name, 0, NS, np.array([0.3, 0.1, 0.0, 0.0]), np.diag([0.01, 0.02, 0.0, 0.0]))
+        pair.tell_life(name, OTHER[name])
+    effects = pair.agents[FIRST].handle(Observation(NS, NS, "range", SECOND, np.array([6.1]), np.array([[0.01]]), "s"))
+    assert not any(isinstance(effect, Persist) and effect.ahead for effect in effects)
+    pair.converse([Letter(FIRST, SECOND, NS, item.body) for item in effects if isinstance(item, Send)])
+    before = pair.agents[FIRST].filter.state.cov
+    pair.lives[SECOND] += 1
+    pair.tell_life(SECOND, FIRST)
+    assert pair.agents[FIRST].counters["pair.restarts"] == 1
+    np.testing.assert_array_equal(pair.agents[FIRST].filter.state.cov, before)
+    again = begun_again(pair.agents[SECOND].settings)
+    np.testing.assert_array_equal(again.cov, STARTS[SECOND][1])
