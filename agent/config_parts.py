@@ -35,6 +35,9 @@ from network.links import LinkSettings
 MAX_TEAM = 15
 """Others of a team that share a joint belief: time and memory grow with powers of their number."""
 
+PROTECTED = UnsafeSettings()
+"""No protection is switched off."""
+
 
 class LocalizationPart(Part):
     kind: Literal["clat", "replica"] = "clat"
@@ -150,7 +153,7 @@ class NetworkPart(Part):
     hello_period_s: Positive = 0.5
     silent_after_s: Positive = 3.0
 
-    def settings(self, lateness: LatenessPart, unsafe: UnsafeSettings) -> EndpointSettings:
+    def settings(self, lateness: LatenessPart, unsafe: UnsafeSettings = PROTECTED) -> EndpointSettings:
         return EndpointSettings(
             hello_period_ns=nanoseconds(self.hello_period_s),
             silent_after_ns=nanoseconds(self.silent_after_s),
