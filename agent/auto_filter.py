@@ -25,6 +25,7 @@ from agent.effects import Effect, Estimate
 from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.estimation.split_joint import Split
 from agent.events import LinkChange, Observation, Received
+from agent.health import Health
 from agent.joint_filter import JointFilter
 from agent.joint_room import has_room
 from agent.joint_tracks import JointState
@@ -66,28 +67,31 @@ class AutoFilter:
         counters: Counter[str],
         count_nis: CountNis,
         saved: SavedSplit | None = None,
+        *,
+        health: Health | None = None,
     ) -> None:
         """`saved`: what to begin with; the form is `split_joint` then."""
         self._settings, self._counters, self._count_nis = settings, counters, count_nis
+        self._health = health = health or Health(settings.health, counters)
         self._joint: JointFilter | None = None
         self._active: CooperativeFilter
         self._lives: dict[str, LinkChange] = {}
         followed = [(target.id, target.motion.layout) for target in settings.tracked]
         if saved is not None:
-            self._active = SplitFilter(settings, counters, count_nis, saved)
+            self._active = SplitFilter(settings, counters, count_nis, saved, health=health)
             self._why = "started from saved state"
         elif settings.found_out:
-            self._active = SplitFilter(settings, counters, count_nis)
+            self._active = SplitFilter(settings, counters, count_nis, health=health)
             self._why = "the robot has not started with the others"
         elif settings.track_end != TrackEnd() or any(target.mean is None for target in settings.tracked):
-            self._active = SplitFilter(settings, counters, count_nis)
+            self._active = SplitFilter(settings, counters, count_nis, health=health)
             self._why = "tracks start or end"
         elif has_room(settings.layout, followed):
-            self._active = self._joint = JointFilter(settings, counters, count_nis)
+            self._active = self._joint = JointFilter(settings, counters, count_nis, health=health)
             self._joint.group = frozenset((settings.robot,))
             self._why = f"at most {MAX_GROUP} robots have met"
         else:
-            self._active = SplitFilter(settings, counters, count_nis)
+            self._active = SplitFilter(settings, counters, count_nis, health=health)
             self._why = "factors of robot and targets do not fit into a message"
 
     @property
@@ -151,7 +155,8 @@ class AutoFilter:
 
     def _hand_over(self, why: str) -> None:
         assert self._joint is not None
-        split = SplitFilter(self._settings, self._counters, self._count_nis, self._without_factors(self._joint))
+        start = self._without_factors(self._joint)
+        split = SplitFilter(self._settings, self._counters, self._count_nis, start, health=self._health)
         for event in self._lives.values():
             split.link_changed(event)
         self._joint, self._active, self._why = None, split, why

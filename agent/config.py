@@ -27,6 +27,7 @@ from agent.config_parts import (
     MAX_TEAM,
     CalibrationPart,
     CoastPart,
+    HealthPart,
     IntrinsicsPart,
     LandmarkPart,
     LatenessPart,
@@ -49,6 +50,7 @@ from agent.sensor_input import SensorConfig
 from agent.settings import AgentSettings, nanoseconds
 from agent.start_config import InitialPart, check_start
 from agent.target_parts import AgentTargetPart, TrackingPart
+from agent.unsafe_parts import UnsafePart
 
 _LOOPBACK = re.compile(r"\w+/(127\.\d+\.\d+\.\d+|localhost|\[::1\]):\d+(\?.*)?\Z")
 
@@ -161,6 +163,8 @@ class AgentConfig(Part):
     localization: LocalizationPart = LocalizationPart()
     tracking: TrackingPart = TrackingPart()
     lateness: LatenessPart = LatenessPart()
+    health: HealthPart = HealthPart()
+    unsafe: UnsafePart = UnsafePart()
     coast: CoastPart = CoastPart()
     network: NetworkPart = NetworkPart()
     state: StatePart = StatePart()
@@ -186,6 +190,20 @@ class AgentConfig(Part):
         targets = [target.settings() for target in self.targets]
         if form in ("safe", "published"):
             targets = [replace(item, motion=replace(item.motion, persistent_rad2=math.inf)) for item in targets]
+        unsafe, localization, health = (
+            self.unsafe.settings(),
+            self.localization.settings(),
+            self.health.settings(self.localization.form),
+        )
+        lateness, coast = self.lateness.settings(), self.coast.settings()
+        if unsafe.ignore_correlation:
+            localization = replace(localization, correlation="ignored")
+        if unsafe.trust_liars:
+            health = replace(health, enabled=False)
+        if unsafe.trust_clocks:
+            lateness = replace(lateness, clock_sigma_ns=0)
+        if unsafe.ignore_gaps:
+            coast = replace(coast, speed_mps=0.0, yaw_rate_radps=0.0)
         return AgentSettings(
             robot=self.identity.robot,
             start_ns=start_ns,
@@ -196,9 +214,11 @@ class AgentConfig(Part):
             targets=tuple(targets),
             landmarks={item.id: item.place() for item in self.landmarks},
             one_way_sensors=tuple(name for name, part in sorted(self.sensors.items()) if not part.two_way),
-            localization=self.localization.settings(),
-            lateness=self.lateness.settings(),
-            coast=self.coast.settings(),
+            localization=localization,
+            lateness=lateness,
+            health=health,
+            unsafe=unsafe,
+            coast=coast,
             track=self.tracking.kind != "none",
             team=tuple(member.settings() for member in self.team),
             track_end=self.tracking.end(),
@@ -249,6 +269,10 @@ def load_agent_config(path: Path) -> AgentConfig:
             member.settings()
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
+    try:
+        config.health.settings(config.localization.form)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
     if config.localization.kind == "replica" and not config.team:
         raise ConfigError(
             f"{path}: key 'team' is missing: localization.kind = 'replica' needs the id, mean, start_sigma and motion "
@@ -283,4 +307,10 @@ def load_agent_config(path: Path) -> AgentConfig:
         )
     if not simulated and config.injection is not None:
         raise ConfigError(f"{path}: [injection] is refused with a real autopilot; remove it")
+    unsafe = config.unsafe.settings().named()
+    if unsafe and config.clock.source != "run" and (config.mavlink is None or not simulated):
+        raise ConfigError(
+            f"{path}: unsafe.{unsafe[0]} turns a protection off, which is refused on a robot that may be real; "
+            "remove it, or declare the autopilot with mavlink.simulated = true on loopback"
+        )
     return config

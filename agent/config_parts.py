@@ -22,9 +22,11 @@ from agent.estimation.observation import Intrinsics
 from agent.estimation.odometry import OdometryNoise
 from agent.settings import (
     CoastSettings,
+    HealthSettings,
     LatenessSettings,
     LocalizationSettings,
     TeamMember,
+    UnsafeSettings,
     nanoseconds,
 )
 from network.endpoint import EndpointSettings
@@ -32,6 +34,9 @@ from network.links import LinkSettings
 
 MAX_TEAM = 15
 """Others of a team that share a joint belief: time and memory grow with powers of their number."""
+
+PROTECTED = UnsafeSettings()
+"""No protection is switched off."""
 
 
 class LocalizationPart(Part):
@@ -112,6 +117,22 @@ class LatenessPart(Part):
         )
 
 
+class HealthPart(Part):
+    window: Annotated[int, Field(ge=2, le=1000)] = 8
+    suspect_nis: Annotated[float, Field(gt=1.0, allow_inf_nan=False)] = 6.0
+    gate_nis: Annotated[float, Field(gt=1.0, allow_inf_nan=False)] = 12.0
+    readmit_after: Annotated[int, Field(ge=1, le=1000)] = 8
+
+    def settings(self, form: str) -> HealthSettings:
+        """The form `published` is as published, and judges nobody. Raises `ConfigError`."""
+        if self.gate_nis < self.suspect_nis:
+            raise ConfigError(
+                f"health.gate_nis = {self.gate_nis:g} is below health.suspect_nis = {self.suspect_nis:g}, and nobody"
+                " would ever be quarantined; make it at least as large"
+            )
+        return HealthSettings(enabled=form != "published", **self.model_dump())
+
+
 class CoastPart(Part):
     speed_mps: Positive = 0.5
     yaw_rate_radps: Positive = 0.5
@@ -132,13 +153,16 @@ class NetworkPart(Part):
     hello_period_s: Positive = 0.5
     silent_after_s: Positive = 3.0
 
-    def settings(self, lateness: LatenessPart) -> EndpointSettings:
+    def settings(self, lateness: LatenessPart, unsafe: UnsafeSettings = PROTECTED) -> EndpointSettings:
         return EndpointSettings(
             hello_period_ns=nanoseconds(self.hello_period_s),
             silent_after_ns=nanoseconds(self.silent_after_s),
             horizon_ns=nanoseconds(lateness.horizon_s),
             clock_sigma_ns=nanoseconds(lateness.clock_sigma_s),
             max_clock_sigma_ns=nanoseconds(lateness.max_clock_sigma_s),
+            accept_duplicates=unsafe.accept_duplicates,
+            accept_stale=unsafe.accept_stale,
+            trust_clocks=unsafe.trust_clocks,
         )
 
 

@@ -19,6 +19,7 @@ from agent.effects import Alarm, Effect, Estimate, Persist, Publish, Send, Track
 from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError, absolute_model, relative_model, told
 from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received, Tick
 from agent.forms import build_filter
+from agent.health import Health
 from agent.saved_state import decode, encode
 from agent.settings import AgentSettings
 from agent.timeline import MAX_INCREMENTS, MAX_WAITING, Item, OdometryTrack, Phase, Timeline
@@ -54,7 +55,8 @@ class Agent:
         self._timeline = Timeline()
         self._odometry = OdometryTrack(settings.coast, settings.lateness.tolerance_ns, self.counters)
         saved = None if restored is None else restored.saved
-        self.filter: CooperativeFilter = build_filter(settings, self.counters, self._count_nis, saved)
+        self.health = Health(settings.health, self.counters, None if restored is None else restored.verdicts)
+        self.filter: CooperativeFilter = build_filter(settings, self.counters, self._count_nis, self.health, saved)
         self._persisted: object = None
         self._persist_due_ns = self.now_ns
         self._published: object = None
@@ -82,19 +84,21 @@ class Agent:
             if estimate is not None:
                 effects.append(Publish(estimate))
                 self._tell_ends(tuple(track.target for track in estimate.tracks), effects)
+        verdicts = self.health.alarms()
+        effects.extend(verdicts)
         missing = self.missing()
         if missing != self._missing:
             self._missing = missing
             effects.append(Alarm("waiting", "; ".join(missing)) if missing else Alarm("started"))
-        self._persist(effects)
+        self._persist(effects, bool(verdicts))
         return effects
 
-    def _persist(self, effects: list[Effect]) -> None:
-        """Have the state kept: before messages that it must not be older than, and from time to time."""
+    def _persist(self, effects: list[Effect], judged: bool) -> None:
+        """Have the state kept: before messages that it must not be older than, with new verdicts, from time to time."""
         first = next((index for index, effect in enumerate(effects) if isinstance(effect, Send)), None)
-        ahead = first is not None and self.filter.keeps_factors
+        ahead = first is not None and self.filter.keeps_factors and not self.settings.unsafe.send_before_saving
         due = self.now_ns >= self._persist_due_ns and self.filter.revision is not self._persisted
-        if not ahead and not due:
+        if not ahead and not due and not judged:
             return
         payload = self.saved()
         if payload is None:
@@ -105,7 +109,7 @@ class Agent:
     def saved(self) -> bytes | None:
         """What is known now, for another life of this robot; None if it begins without."""
         saved = self.filter.saved()
-        return None if saved is None else encode(self.settings, saved)
+        return None if saved is None else encode(self.settings, saved, self.health.saved())
 
     def _tell_ends(self, tracks: tuple[str, ...], effects: list[Effect]) -> None:
         if tracks != self._tracks:
@@ -130,7 +134,7 @@ class Agent:
             begun = self.filter.begun()
             if begun is not None:
                 self.settings = begun
-                self.filter = build_filter(begun, self.counters, self._count_nis)
+                self.filter = build_filter(begun, self.counters, self._count_nis, self.health)
 
     def next_deadline_ns(self) -> int:
         """When `handle` wants a `Tick` at the latest, should nothing else happen."""
@@ -171,6 +175,8 @@ class Agent:
             "form_reason": why,
             "waiting": len(self._timeline),
             "pairs": {peer: epoch.t_meas_ns for peer, epoch in self.filter.contacts().items()},
+            "unsafe": self.settings.unsafe.named(),
+            "health": self.health.status(self.now_ns),
             "counters": dict(self.counters),
         }
 
@@ -212,7 +218,7 @@ class Agent:
     def _receive(self, event: Received, effects: list[Effect]) -> None:
         body = event.message.body
         if isinstance(body, PairRequest | SplitRequest | StartRequest):
-            self._queue(Item(self.filter.instant_ns(event), Phase.PAIR, event.message.header.source, event))
+            self._queue(Item(self._asked_ns(event), Phase.PAIR, event.message.header.source, event))
         elif isinstance(body, PairReply | SplitReply):
             self._drain(effects)
             self.filter.replied(event.message.header.source, body)
@@ -220,6 +226,12 @@ class Agent:
         else:
             self._drain(effects)
             self.filter.heard(event, effects)
+
+    def _asked_ns(self, event: Received) -> int:
+        """The instant that a peer's request refers to, on the own clock."""
+        t_ns, unsafe = self.filter.instant_ns(event), self.settings.unsafe
+        gone = t_ns < self.filter.t_ns - self.settings.lateness.horizon_ns
+        return max(t_ns, self.filter.t_ns) if unsafe.use_late_as_new or (unsafe.accept_stale and gone) else t_ns
 
     # -- time -----------------------------------------------------------------------------------------------
 

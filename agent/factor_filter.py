@@ -21,6 +21,7 @@ from agent.estimation.observation import AbsoluteModel, RelativeModel, relative_
 from agent.estimation.track_start import TrackStart
 from agent.events import LinkChange, Observation, Received
 from agent.factor_model import AnySnapshot, FactorModel, SeparateModel
+from agent.health import Health
 from agent.history import History
 from agent.pairs import Pairs
 from agent.saved_state import SavedFactors
@@ -42,6 +43,8 @@ class FactorFilter:
         counters: Counter[str],
         count_nis: Callable[[str, float], None],
         saved: SavedFactors | None = None,
+        *,
+        health: Health | None = None,
     ) -> None:
         """`saved`: what to begin with, instead of what the settings say."""
         self._settings, self._counters, self._count_nis = settings, counters, count_nis
@@ -50,7 +53,7 @@ class FactorFilter:
         self.model = self._model()
         self.state = self.model.initial() if saved is None else saved.state
         self.history = History(settings, self.model, self.state)
-        self._pairs = Pairs(settings, self.model, counters, count_nis)
+        self._pairs = Pairs(settings, self.model, counters, count_nis, health or Health(settings.health, counters))
         if saved is not None:
             self._pairs.restore(saved)
 

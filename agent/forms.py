@@ -8,6 +8,7 @@ from collections.abc import Callable
 from agent.auto_filter import AutoFilter
 from agent.cooperative_filter import CooperativeFilter
 from agent.factor_filter import FactorFilter
+from agent.health import Health
 from agent.joint_filter import JointFilter
 from agent.replica_filter import ReplicaFilter
 from agent.saved_state import Saved, SavedFactors, SavedSplit
@@ -20,26 +21,28 @@ def build_filter(
     settings: AgentSettings,
     counters: Counter[str],
     count_nis: Callable[[str, float], None],
+    health: Health,
     saved: Saved | None = None,
 ) -> CooperativeFilter:
     """The filter of `settings.localization`; of a robot that does not know where it is, one that waits for it.
 
     `saved`: what it begins with, which is of the form of the settings (`agent.saved_state.decode`).
+    The kind `replica` does not judge its peers.
     """
     if isinstance(saved, SavedFactors):
         kept = JointFilter if settings.localization.form == "joint" else FactorFilter
-        return kept(settings, counters, count_nis, saved)
+        return kept(settings, counters, count_nis, saved, health=health)
     if isinstance(saved, SavedSplit):
         split = AutoFilter if settings.localization.form == "auto" else SplitFilter
-        return split(settings, counters, count_nis, saved)
+        return split(settings, counters, count_nis, saved, health=health)
     if settings.source != "survey":
         return WaitingFilter(settings, counters)
     if settings.localization.kind == "replica":
         return ReplicaFilter(settings, counters, count_nis)
     if settings.localization.form == "split_joint":
-        return SplitFilter(settings, counters, count_nis)
+        return SplitFilter(settings, counters, count_nis, health=health)
     if settings.localization.form == "auto":
-        return AutoFilter(settings, counters, count_nis)
+        return AutoFilter(settings, counters, count_nis, health=health)
     if settings.localization.form == "joint":
-        return JointFilter(settings, counters, count_nis)
-    return FactorFilter(settings, counters, count_nis)
+        return JointFilter(settings, counters, count_nis, health=health)
+    return FactorFilter(settings, counters, count_nis, health=health)

@@ -256,6 +256,8 @@ class JointFactors:
         cross, complete = found
         if not initiator_is_low:
             cross = cross.T
+        if self._settings.localization.correlation == "ignored":
+            cross = np.zeros((n, m))
         joint = np.block([[P_i, cross], [cross.T, P_j]])
         if not is_positive_definite(joint):
             # Robots that have only the prior in common correlate perfectly; a thousandth of it is forgotten then.

@@ -10,6 +10,7 @@ from agent.effects import Estimate, TrackEstimate
 from agent.events import Observation
 from agent.factor_filter import FactorFilter
 from agent.factor_model import FactorModel
+from agent.health import Health
 from agent.joint_factors import JointFactors
 from agent.saved_state import SavedFactors
 from agent.settings import AgentSettings
@@ -24,8 +25,10 @@ class JointFilter(FactorFilter):
         counters: Counter[str],
         count_nis: Callable[[str, float], None],
         saved: SavedFactors | None = None,
+        *,
+        health: Health | None = None,
     ) -> None:
-        super().__init__(settings, counters, count_nis, saved)
+        super().__init__(settings, counters, count_nis, saved, health=health)
         if saved is not None:
             self._factors.group, self._factors.nonlinearity = saved.group, saved.nonlinearity
 

@@ -18,7 +18,7 @@ from agent.estimation.colocalization import Options, sighting_update
 from agent.estimation.gaussian import is_positive_definite, symmetrize, wrap_components
 from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.estimation.split_joint import Split, SplitUpdate, update_from_peer, update_own, update_own_recurring
-from agent.joint_layout import JointLayout
+from agent.joint_layout import JointLayout, Met
 from agent.joint_tracks import JointState, JointTracks, learnt
 from agent.settings import AgentSettings
 from network.messages import Measurement, SplitSnapshot
@@ -235,31 +235,34 @@ class JointModel:
             self.tracks.told(state)[:relayed],
         )
 
-    def from_peer(
-        self,
-        state: JointState,
-        told: SplitSnapshot,
-        measurements: Sequence[Measurement],
-        own_observed: bool,
-        trusted: bool,
-    ) -> Used:
-        """Use the relative measurements of a contact and the common targets, for the own belief only.
+    def met(
+        self, state: JointState, told: SplitSnapshot, measurements: Sequence[Measurement], own_observed: bool
+    ) -> Met:
+        """Evaluate the relative measurements of a contact and the common targets; nothing is used of them yet.
 
-        `own_observed`: the own sensor measured the peer, not the other way round. `trusted`: what the peer calls its
-        private noise is uncorrelated with the own error still. The state is left alone if nothing is gained.
+        `own_observed`: the own sensor measured the peer, not the other way round.
         """
         layout = self._layout(state)
         own = SplitSnapshot(self._settings.layout.name, layout.models, state.mean, state.cov)
         i, j = (own, told) if own_observed else (told, own)
-        met = layout.met(i, j, None, measurements, RESIDUAL_FACTOR, SAME_TARGET_M2)
+        return layout.met(i, j, None, measurements, RESIDUAL_FACTOR, SAME_TARGET_M2)
+
+    def from_peer(self, state: JointState, told: SplitSnapshot, met: Met, own_observed: bool, trusted: bool) -> Used:
+        """Use a contact as it has been evaluated (see `met`), for the own belief only.
+
+        `trusted`: what the peer calls its private noise is uncorrelated with the own error still. The state is left
+        alone if nothing is gained.
+        """
         H_own, H_other = (met.H_i, met.H_j) if own_observed else (met.H_j, met.H_i)
         k = len(told.mean)
         private = told.private if trusted and told.private is not None else np.zeros((k, k))
-        other, recurring = Split(private, told.cov - private), RECURRING * symmetrize(met.residual)
+        own, other, recurring = state.split, Split(private, told.cov - private), RECURRING * symmetrize(met.residual)
+        if self._settings.localization.correlation == "ignored":
+            own, other = (Split(cov, np.zeros_like(cov)) for cov in (state.cov, told.cov))
         heading = self._settings.layout.heading
         lost = heading is not None and state.cov[heading, heading] > INDIFFERENT_RAD2
         indifferent = (heading,) if lost and heading is not None else ()
-        update = update_from_peer(state.split, other, H_own, H_other, met.R, recurring, indifferent)
+        update = update_from_peer(own, other, H_own, H_other, met.R, recurring, indifferent)
         if update is not None:
             state = self._shifted(state, update.K @ met.nu, update.split)
             ages = zip(told.targets, told.ages_ns)

@@ -20,7 +20,11 @@ Rules
 8. A robot that is started again with its factors, which are those of its last message at least, has the same
    incarnation: what was pending is void on both sides, as if it had been lost, and nothing else changes. It no longer
    has the replies it gave, so a repeated request of the last contact applied is left without an answer.
-9. If the correlation can't be recovered from the two snapshots (a line was forgotten, a side has lost its factors)
+9. A contact that the responder does not use because it is inconsistent (`agent.health`) is answered INCONSISTENT: by
+   that the initiator knows that nobody has used it, and drops its line. No contact up to it is used later, whatever
+   is repeated, and after a start as well. An initiator that does not use an answer for that reason keeps its line: the
+   responder has used the contact, and the next one finds it as the peer's base, as if the answer had been lost.
+10. If the correlation can't be recovered from the two snapshots (a line was forgotten, a side has lost its factors)
    both sides see that alike. Neither uses the measurement; each doubles its own covariance, once in a while at most,
    and the pair begins anew uncorrelated: blk(2 P_a, 2 P_b) bounds the joint covariance whatever the correlation.
 
@@ -51,6 +55,7 @@ class Step(Enum):
     APPLY_ABANDON_OWN = "apply_abandon_own"
     REPEAT_REPLY = "repeat_reply"
     ANSWER_BUSY = "answer_busy"
+    ANSWER_INCONSISTENT = "answer_inconsistent"
     ANSWER_SUPERSEDED = "answer_superseded"
     DROP_LINE = "drop_line"
     IGNORE = "ignore"
@@ -105,6 +110,8 @@ class PairExchange:
         self._last_reply: PairReply | None = None
         # The own latest request, and until when the peer may receive it.
         self._opened, self._until_ns = NEVER, 0
+        # The latest contact of the peer that was inconsistent.
+        self._refused = NEVER
         self.pending: Pending | None = None
 
     @property
@@ -142,6 +149,8 @@ class PairExchange:
             return Step.IGNORE
         if base.met and epoch <= base:
             return Step.ANSWER_SUPERSEDED
+        if epoch <= self._refused:
+            return Step.ANSWER_INCONSISTENT
         step = REQUEST_TABLE[self.pending is not None, self.is_low, self._crossed(request)]
         if step is Step.APPLY_ABANDON_OWN:
             self.pending = None
@@ -161,6 +170,8 @@ class PairExchange:
     def answered(self, reply: PairReply) -> PairReply:
         """Remember the reply given, for a repeated request."""
         self._last_reply = reply
+        if reply.status is ReplyStatus.INCONSISTENT:
+            self._refused = max(self._refused, reply.epoch)
         return reply
 
     @property
@@ -193,6 +204,7 @@ class PairExchange:
         """The peer began a new life: nothing of the old one will be answered."""
         self.pending = self._last_reply = None
         self._opened, self._until_ns = NEVER, 0
+        self._refused = NEVER
 
     def resumed(self) -> None:
         """The peer was started again and has kept its factors: it may not know what is pending. The line stays."""
@@ -200,8 +212,9 @@ class PairExchange:
 
     def saved(self) -> SavedExchange:
         """What the own next life must remember."""
-        return SavedExchange(self._counter, self._opened, self._until_ns)
+        return SavedExchange(self._counter, self._opened, self._until_ns, self._refused)
 
     def restore(self, saved: SavedExchange) -> None:
         """Go on after an earlier life of the own robot."""
         self._counter, self._opened, self._until_ns = saved.counter, saved.opened, saved.until_ns
+        self._refused = saved.refused

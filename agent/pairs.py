@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from agent.belief import Part, RobotState
 from agent.effects import Effect, Send
-from agent.estimation.colocalization import pair_update
+from agent.estimation.colocalization import Contact, pair_update
 from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError
 from agent.events import LinkChange, Received
 from agent.factor_model import AnySnapshot, FactorModel
+from agent.health import Health
 from agent.history import History
 from agent.pair_clock import PairClocks
 from agent.pairing import PairExchange, Step
@@ -26,6 +27,12 @@ Array = NDArray[np.float64]
 
 FAR_FUTURE_NS = 2**62
 
+REFUSALS = {
+    Step.ANSWER_BUSY: ReplyStatus.BUSY,
+    Step.ANSWER_SUPERSEDED: ReplyStatus.SUPERSEDED,
+    Step.ANSWER_INCONSISTENT: ReplyStatus.INCONSISTENT,
+}
+
 
 class Pairs:
     """The pair protocol with every peer met, bounded in number by the endpoint."""
@@ -36,8 +43,9 @@ class Pairs:
         model: FactorModel,
         counters: Counter[str],
         count_nis: Callable[[str, float], None],
+        health: Health,
     ) -> None:
-        self._count_nis = count_nis
+        self._count_nis, self._health = count_nis, health
         self._settings, self._model, self._counters = settings, model, counters
         self._exchanges: dict[str, PairExchange] = {}
         self._lives: dict[str, tuple[int, int]] = {}
@@ -137,7 +145,7 @@ class Pairs:
         if step is Step.REPEAT_REPLY and exchange.last_reply is not None:
             effects.append(Send(peer, epoch.t_meas_ns, exchange.last_reply))
             return state
-        refusal = {Step.ANSWER_BUSY: ReplyStatus.BUSY, Step.ANSWER_SUPERSEDED: ReplyStatus.SUPERSEDED}.get(step)
+        refusal = REFUSALS.get(step)
         if refusal is not None:
             effects.append(Send(peer, epoch.t_meas_ns, PairReply(epoch, refusal)))
             return state
@@ -151,9 +159,15 @@ class Pairs:
             self._counters["pair.too_large"] += 1
             effects.append(Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.BUSY))))
             return state
+        found = self._evaluated(peer, request.snapshot, own, request.measurements, False)
+        if found is not None and found.cross is not None and not self._health.usable(peer, t_ns, found.nis, False):
+            effects.append(Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.INCONSISTENT))))
+            return state
         effects.append(Send(peer, epoch.t_meas_ns, exchange.answered(PairReply(epoch, ReplyStatus.OK, own))))
         state = history.opened(then.t_ns, peer, epoch)
-        return self._apply(peer, epoch, request.snapshot, own, request.measurements, False, t_ns, state, history)
+        if found is None:
+            return state
+        return self._apply(peer, epoch, request.snapshot, found, request.measurements, False, t_ns, state, history)
 
     def asked(
         self, event: Received, request: StartRequest, t_ns: int, history: History, effects: list[Effect]
@@ -175,6 +189,8 @@ class Pairs:
     def reply(self, peer: str, reply: PairReply, state: RobotState, history: History) -> RobotState:
         """The peer answered a contact."""
         step, pending = self.exchange(peer).replied(reply, state.pair(peer).base)
+        if pending is not None:
+            self._health.answered(peer, reply.status is ReplyStatus.INCONSISTENT)
         self._counters[f"pair.reply_{step.value}"] += 1
         if step is Step.DROP_LINE:
             self._counters[f"pair.answer_{reply.status.name.lower()}"] += 1
@@ -187,17 +203,13 @@ class Pairs:
             self._counters["pair.malformed"] += 1
             return state
         sent = pending.request
-        return self._apply(
-            peer,
-            sent.epoch,
-            sent.snapshot,
-            reply.snapshot,
-            sent.measurements,
-            True,
-            sent.epoch.t_meas_ns,
-            state,
-            history,
-        )
+        epoch, t_ns = sent.epoch, sent.epoch.t_meas_ns
+        found = self._evaluated(peer, sent.snapshot, reply.snapshot, sent.measurements, True)
+        if found is None:
+            return state
+        if found.cross is not None and not self._health.usable(peer, t_ns, found.nis, True):
+            return state
+        return self._apply(peer, epoch, reply.snapshot, found, sent.measurements, True, t_ns, state, history)
 
     def link_changed(self, event: LinkChange, state: RobotState, history: History) -> RobotState:
         """A peer appeared, fell silent or was started again.
@@ -229,6 +241,9 @@ class Pairs:
 
         No peer may inflate us again within `restart_interval_ns`; its correlation counts as unknown until then.
         """
+        if self._settings.unsafe.trust_restarts:
+            self._counters["pair.restarts"] += 1
+            return state.forgotten(peer, known=True)
         last = self._inflated_ns.get(peer)
         if last is not None and now_ns - last < self._settings.localization.restart_interval_ns:
             self._counters["pair.restart_refused"] += 1
@@ -239,12 +254,30 @@ class Pairs:
 
     # -- estimation -----------------------------------------------------------------------------------------
 
+    def _evaluated(
+        self,
+        peer: str,
+        initiator: AnySnapshot,
+        responder: AnySnapshot,
+        measurements: tuple[Measurement, ...],
+        own_initiated: bool,
+    ) -> Contact | None:
+        """What the two snapshots make of a contact, nothing used of it yet; None, counted, if that is nothing."""
+        own_is_low = self._settings.robot < peer
+        try:
+            return self._model.contact(initiator, responder, own_is_low == own_initiated, measurements)
+        except OutOfViewError:
+            self._counters["pair.out_of_view"] += 1
+        except np.linalg.LinAlgError:
+            self._counters["pair.indefinite"] += 1
+        return None
+
     def _apply(
         self,
         peer: str,
         epoch: Epoch,
-        initiator: AnySnapshot,
-        responder: AnySnapshot,
+        other: AnySnapshot,
+        found: Contact,
         measurements: tuple[Measurement, ...],
         own_initiated: bool,
         t_ns: int,
@@ -253,16 +286,6 @@ class Pairs:
     ) -> RobotState:
         localization = self._settings.localization
         correlated = localization.correlation == "factors"
-        other = responder if own_initiated else initiator
-        own_is_low = self._settings.robot < peer
-        try:
-            found = self._model.contact(initiator, responder, own_is_low == own_initiated, measurements)
-        except OutOfViewError:
-            self._counters["pair.out_of_view"] += 1
-            return state
-        except np.linalg.LinAlgError:
-            self._counters["pair.indefinite"] += 1
-            return state
         key = (Part.LINE, peer, epoch)
         then = history.first_with(key)
         line = None if then is None else then.stack.block(key)

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from agent.belief import BlockKey, CorrelationStack, PairRecord, Part, RobotState, TargetState
 from agent.estimation.gaussian import is_positive_definite
 from agent.estimation.split_joint import Split
+from agent.health import SavedVerdict
 from agent.joint_layout import JointLayout
 from agent.joint_tracks import JointState, RelayedTrack
 from agent.settings import AgentSettings
@@ -47,9 +48,11 @@ from network.wire_fields import (
 
 Array = NDArray[np.float64]
 
-FORMAT = 1
+FORMAT = 2
 MAX_BYTES = 4_000_000
 MAX_TRACKS = 256
+MAX_WINDOW = 1000
+"""Contacts with a peer that a verdict on it may rest on."""
 ASYMMETRY = 1e-9
 """Rounding, relative to the largest element, by which a covariance may be asymmetric."""
 
@@ -69,11 +72,15 @@ class StateError(ValueError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SavedExchange:
-    """Of the protocol with one peer: contacts opened so far, the last one, and until when the peer may receive it."""
+    """Of the protocol with one peer: contacts opened so far, the last one, and until when the peer may receive it.
+
+    `refused`: the latest of the peer's contacts that was answered as inconsistent.
+    """
 
     counter: int
     opened: Epoch = NEVER
     until_ns: int = 0
+    refused: Epoch = NEVER
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,10 +115,14 @@ Saved = SavedFactors | SavedSplit
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Restored:
-    """A state that fits its settings. `start_ns`: when the robot first started, which may be long ago."""
+    """A state that fits its settings. `start_ns`: when the robot first started, which may be long ago.
+
+    `verdicts`: what is known of peers, see `agent.health`.
+    """
 
     start_ns: int
     saved: Saved
+    verdicts: dict[str, SavedVerdict] = field(default_factory=dict)
 
     @property
     def t_ns(self) -> int:
@@ -141,7 +152,7 @@ def begun_again(settings: AgentSettings) -> AgentSettings:
     whole belief counts as shared. A fix, or a place that a peer tells, is new information, and needs nothing.
     """
     localization = settings.localization
-    if settings.source != "survey" or localization.kind == "replica":
+    if settings.source != "survey" or localization.kind == "replica" or settings.unsafe.trust_restarts:
         return settings
     if localization.form in ("auto", "split_joint"):
         return replace(settings, shared=settings.cov, found_out=True)
@@ -154,20 +165,29 @@ def begun_again(settings: AgentSettings) -> AgentSettings:
 # -- writing --------------------------------------------------------------------------------------------------
 
 
-def encode(settings: AgentSettings, saved: Saved) -> bytes:
-    """The bytes of a state of a robot of these settings."""
+def encode(settings: AgentSettings, saved: Saved, verdicts: dict[str, SavedVerdict]) -> bytes:
+    """The bytes of a state of a robot of these settings, and of its verdicts on peers."""
     if isinstance(saved, SavedFactors):
         form, body = settings.localization.form, _factors(settings, saved)
     else:
         form, body = "split_joint", _split(settings, saved)
     state = saved.state
     head = FORMAT, settings.robot, form, settings.layout.name, settings.start_ns, state.t_ns
-    payload: bytes = msgpack.packb([*head, _bytes(state.mean), _bytes(saved.state.cov), body])
+    payload: bytes = msgpack.packb(
+        [*head, _bytes(state.mean), _bytes(saved.state.cov), body, _verdicts(verdicts)]
+    )
     return payload
 
 
 def _bytes(array: Array) -> bytes:
     return np.ascontiguousarray(array, "<f8").tobytes()
+
+
+def _verdicts(verdicts: dict[str, SavedVerdict]) -> list[Any]:
+    return [
+        [peer, list(item.recent), list(item.good), item.quarantined, item.since_ns, item.nis]
+        for peer, item in verdicts.items()
+    ]
 
 
 def _factors(settings: AgentSettings, saved: SavedFactors) -> list[Any]:
@@ -183,7 +203,8 @@ def _factors(settings: AgentSettings, saved: SavedFactors) -> list[Any]:
         for (part, peer, epoch), (begin, end) in state.stack.blocks.items()
     ]
     exchanges = [
-        [peer, item.counter, pack_epoch(item.opened), item.until_ns] for peer, item in saved.exchanges.items()
+        [peer, item.counter, pack_epoch(item.opened), item.until_ns, pack_epoch(item.refused)]
+        for peer, item in saved.exchanges.items()
     ]
     return [
         [list(item) for item in models],
@@ -238,7 +259,7 @@ def _decoded(raw: Any, settings: AgentSettings) -> Restored:
         raise StateError("malformed")
     if raw[0] != FORMAT:
         raise StateError("other_version")
-    _, robot, form, model, start, instant, mean, cov, body = read_fields(raw, 9)
+    _, robot, form, model, start, instant, mean, cov, body, verdicts = read_fields(raw, 10)
     localization = settings.localization
     if read_id(robot) != settings.robot:
         raise StateError("other_robot")
@@ -251,7 +272,26 @@ def _decoded(raw: Any, settings: AgentSettings) -> Restored:
     if start_ns > t_ns:
         raise StateError("inconsistent")
     read = _read_split if expected == "split_joint" else _read_factors
-    return Restored(start_ns, read(settings, t_ns, mean, cov, body))
+    return Restored(start_ns, read(settings, t_ns, mean, cov, body), _by_id(verdicts, 5, _read_verdict))
+
+
+def _read_verdict(fields: tuple[Any, ...]) -> SavedVerdict:
+    recent, good, quarantined, since_ns, nis = fields
+    return SavedVerdict(
+        tuple(_nis(item) for item in read_items(recent, MAX_WINDOW)),
+        tuple(_nis(item) for item in read_items(good, MAX_WINDOW)),
+        _flag(quarantined),
+        None if since_ns is None else _stamp(since_ns),
+        _nis(nis),
+    )
+
+
+def _nis(raw: Any) -> float:
+    if type(raw) is not float:
+        raise StateError("wrong_type")
+    if not 0.0 <= raw <= MAX_INT:
+        raise StateError("out_of_range")
+    return raw
 
 
 def _read_factors(settings: AgentSettings, t_ns: int, mean: Any, cov: Any, body: Any) -> SavedFactors:
@@ -273,15 +313,15 @@ def _read_factors(settings: AgentSettings, t_ns: int, mean: Any, cov: Any, body:
     if state.targets and joint is not None:
         raise StateError("inconsistent")
     _check_stack(state, n, c, joint is not None)
-    if type(nonlinearity) is not float or not 0.0 <= nonlinearity <= MAX_INT:
-        raise StateError("out_of_range")
     return SavedFactors(
         state,
-        _by_id(exchanges, 3, lambda f: SavedExchange(read_integer(f[0]), read_epoch(f[1]), _stamp(f[2]))),
+        _by_id(
+            exchanges, 4, lambda f: SavedExchange(read_integer(f[0]), read_epoch(f[1]), _stamp(f[2]), read_epoch(f[3]))
+        ),
         _by_id(lives, 2, lambda f: (read_integer(f[0]), read_integer(f[1]))),
         _by_id(inflated, 1, lambda f: _stamp(f[0])),
         None if group is None else frozenset(read_id(item) for item in read_items(group, MAX_GROUP)),
-        nonlinearity,
+        _nis(nonlinearity),
     )
 
 

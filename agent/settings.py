@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 import numpy as np
@@ -65,6 +65,53 @@ class LatenessSettings:
     horizon_ns: int = 5 * NS
     odometry_wait_ns: int = NS
     clock_sigma_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class HealthSettings:
+    """When a peer's contacts are no longer used, and when they are again; see `agent.health`.
+
+    window         contacts that are looked at
+    suspect_nis    mean normalized innovation squared per degree of freedom at which a peer is quarantined
+    gate_nis       a single contact beyond it is not used, and counts as much
+    readmit_after  consistent contacts in a row after which a peer is re-admitted
+    """
+
+    enabled: bool = True
+    window: int = 8
+    suspect_nis: float = 6.0
+    gate_nis: float = 12.0
+    readmit_after: int = 8
+
+
+@dataclass(frozen=True, slots=True)
+class UnsafeSettings:
+    """Protections that are switched off, each by its own switch; for demonstrations.
+
+    ignore_correlation   peers' errors count as independent of the own one: the same information is used again and again
+    ignore_gaps          a robot whose odometry is silent, or that was down, has not moved
+    trust_liars          no contact is refused for its innovation, and nobody quarantined
+    trust_clocks         peers' clocks count as right, whatever is measured of them
+    accept_duplicates    packets are taken as often as they arrive, and without factors contacts are used as often
+    accept_stale         messages of any age are taken; of what the past no longer reaches back to, as if of now
+    use_late_as_new      peers' measurements are used as if made when they arrive
+    trust_restarts       who begins anew, or has lost a correlation, counts as independent; no covariance is doubled
+    send_before_saving   messages of contacts do not wait for the state file that they rely on
+    """
+
+    ignore_correlation: bool = False
+    ignore_gaps: bool = False
+    trust_liars: bool = False
+    trust_clocks: bool = False
+    accept_duplicates: bool = False
+    accept_stale: bool = False
+    use_late_as_new: bool = False
+    trust_restarts: bool = False
+    send_before_saving: bool = False
+
+    def named(self) -> list[str]:
+        """The switches that are on."""
+        return [item.name for item in fields(self) if getattr(self, item.name)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +180,8 @@ class AgentSettings:
     localization: LocalizationSettings = field(default_factory=LocalizationSettings)
     lateness: LatenessSettings = field(default_factory=LatenessSettings)
     coast: CoastSettings = field(default_factory=CoastSettings)
+    health: HealthSettings = HealthSettings()
+    unsafe: UnsafeSettings = UnsafeSettings()
     track: bool = True
     team: tuple[TeamMember, ...] = ()
     track_end: TrackEnd = TrackEnd()

@@ -115,6 +115,8 @@ class AgentShell:
                 raise PermissionError(errno.EACCES, "permission denied")
         except OSError as error:
             raise ConfigError(f"state_dir {self._state_dir} cannot be written: {error.strerror}") from None
+        for switch in config.unsafe.settings().named():
+            log.warning("UNSAFE: unsafe.%s turns a protection off: estimates may claim more than they know", switch)
         if config.zenoh.insecure_lan:
             log.warning("zenoh.insecure_lan: messages to peers are neither encrypted nor authenticated")
         self._boot_id = secrets.randbits(53)
@@ -217,7 +219,7 @@ class AgentShell:
                 self._recording.begin_life(self.robot, start_ns, begin.state)
         self._node = Node(
             begin.settings,
-            config.network.settings(config.lateness),
+            config.network.settings(config.lateness, config.unsafe.settings()),
             boot_id=self._boot_id,
             incarnation=begin.incarnation,
             software=SOFTWARE,

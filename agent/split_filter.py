@@ -24,7 +24,9 @@ from agent.estimation.observation import (
     relative_model,
 )
 from agent.events import LinkChange, Observation, Received
+from agent.health import Health
 from agent.joint_history import JointHistory, Learnt
+from agent.joint_layout import Met
 from agent.joint_state import CONTRADICTIONS, JointModel, Used
 from agent.joint_tracks import JointState
 from agent.pair_clock import PairClocks
@@ -64,9 +66,12 @@ class SplitFilter:
         counters: Counter[str],
         count_nis: Callable[[str, float], None],
         saved: SavedSplit | None = None,
+        *,
+        health: Health | None = None,
     ) -> None:
         """`saved`: what to begin with, instead of what the settings say."""
         self._settings, self._counters, self._count_nis = settings, counters, count_nis
+        self._health = health or Health(settings.health, counters)
         self._model = JointModel(settings)
         first = self._model.tracks.initial() if saved is None else saved.state
         self._known_ns = None if saved is None else saved.until_ns
@@ -271,7 +276,7 @@ class SplitFilter:
             self._counters["pair.malformed"] += 1
             return
         exchange, epoch = self._exchange(peer), request.epoch
-        if exchange.known(epoch):
+        if exchange.known(epoch) and not self._settings.unsafe.accept_duplicates:
             self._counters["pair.request_repeat_reply"] += 1
             reply = exchange.reply_to(epoch)
             if reply is not None:
@@ -316,15 +321,24 @@ class SplitFilter:
             self._counters["pair.too_old_own"] += 1
             return
 
-        def use(state: JointState, trusted: bool) -> Used:
-            return self._model.from_peer(state, told, measurements, own_initiated, trusted)
+        def met(state: JointState) -> Met:
+            return self._model.met(state, told, measurements, own_initiated)
+
+        def use(state: JointState, found: Met, trusted: bool) -> Used:
+            return self._model.from_peer(state, told, found, own_initiated, trusted)
 
         try:
-            # What turns up later may have gone through third robots: the peer's private noise is not independent then.
-            used = self._learn(then, lambda state: use(state, True), lambda state: use(state, False).state)
+            found = met(then)
         except OutOfViewError:
             self._counters["pair.out_of_view"] += 1
             return
+        except np.linalg.LinAlgError:
+            self._counters["update.not_positive_definite"] += 1
+            return
+        if not self._health.usable(peer, t_ns, found.nis, own_initiated):
+            return
+        # What turns up later may have gone through third robots: the peer's private noise is not independent then.
+        used = self._learn(then, lambda s: use(s, found, True), lambda s: use(s, met(s), False).state)
         if used is None:
             return
         self._contacts[peer] = epoch

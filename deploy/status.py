@@ -162,10 +162,15 @@ class LiveTable:
         title = f"{self._scenario.name}  {played:.0f} / {self._scenario.duration_s:.0f} s  at {self._speed:g} x"
         links = self._scenario.links.model_dump(exclude_defaults=True)
         injected = ", ".join([*(f"{name} {value:g}" for name, value in links.items()), *launcher.injected()])
+        unsafe = self._scenario.unsafe.settings().named()
+        notes = [f"UNSAFE: {', '.join(unsafe)}"] if unsafe else []
+        notes += [f"injected: {injected}"] if injected else []
+        for name, running in sorted(launcher.members.items()):
+            notes += [f"{name}: {reason}" for reason in running.status.get("health", {}).get("reasons", [])]
         table = Table(
             title=title,
             title_justify="left",
-            caption=f"injected: {injected}" if injected else None,
+            caption=escape("\n".join(notes)) if notes else None,
             caption_justify="left",
         )
         for name in LIVE_TEXT:
@@ -189,7 +194,13 @@ def _cells(exit_code: int | None, status: dict[str, Any]) -> list[str]:
         return ["waiting" if status.get("missing") else "starting", "; ".join(status.get("missing", [])), *blank[1:]]
     counters = status.get("counters", {})
     contacts = counters.get("pair.applied_initiator", 0) + counters.get("pair.applied_responder", 0)
-    peers = " ".join(peer for peer, up in sorted(status.get("peers", {}).items()) if up)
+    judged = status.get("health", {}).get("peers", {})
+    quarantined = {peer for peer, found in judged.items() if found["verdict"] == "quarantined"}
+    peers = " ".join(
+        f"[red]{peer} (quarantined)[/red]" if peer in quarantined else peer
+        for peer, up in sorted(status.get("peers", {}).items())
+        if up
+    )
     return [
         "running",
         peers or "none heard",
@@ -258,6 +269,8 @@ def print_summary(summary: dict[str, Any], run_dir: Path, report: Path | None) -
         console.print("rejected: " + ", ".join(f"{name} {count}" for name, count in summary["rejected"].items()))
     if summary["faults"]:
         console.print("injected: " + ", ".join(summary["faults"]))
+    if summary["unsafe"]:
+        console.print("[red]UNSAFE: protections are off: " + ", ".join(summary["unsafe"]) + "[/red]")
     if report is not None:
         console.print(f"report: {report}", soft_wrap=True)
     console.print(f"run directory: {run_dir}", soft_wrap=True)

@@ -211,6 +211,7 @@ class ReplyStatus(IntEnum):
     BUSY = 2
     SUPERSEDED = 3
     OTHER_FORM = 4
+    INCONSISTENT = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)

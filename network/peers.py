@@ -42,7 +42,7 @@ class DuplicateWindow:
         """Remember that `seq` was accepted."""
         ahead = seq - self._highest
         if ahead <= 0:
-            self._seen |= 1 << -ahead
+            self._seen |= 1 << -ahead & _MASK
         else:
             self._seen = 1 if ahead >= WINDOW else (self._seen << ahead | 1) & _MASK
             self._highest = seq

@@ -50,6 +50,8 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
         "tracking": table(scenario.tracking_of(robot)),
         "lateness": table(scenario.lateness_of(robot)),
         "coast": table(scenario.coast),
+        "health": table(scenario.health),
+        "unsafe": table(scenario.unsafe),
         "network": table(scenario.network),
         "state": table(scenario.state),
         "sensors": {

@@ -9,6 +9,7 @@ says what was broken, by whom, when, and how to see it again.
     books         what the endpoint received is what it delivered, hellos and refusals
     bounds        every buffer keeps within its stated bound
     contacts      with factors, the last contact of a pair never becomes an earlier one within a life
+    once          no contact is used twice within a life
     information   without information a pose gets no surer: motion keeps the volume of its uncertainty and adds noise
     split         private and shared parts of a covariance are positive semi-definite and add up to it
     counters      no counter falls, and there are only so many
@@ -38,8 +39,14 @@ Array = NDArray[np.float64]
 MAX_COUNTERS = 256
 ROUNDING = 1e-9
 
-LEARNING = ("pair.applied", "start.", "track.", "team.")
-"""Counters that tell of information used besides those of the NIS."""
+LEARNING = ("pair.applied", "pair.quarantined", "pair.gated", "start.", "track.", "team.")
+"""Counters that tell of information used besides those of the NIS, or of an instant it was looked at for.
+
+Motion up to such an instant and from there is not quite the motion over the whole step.
+"""
+
+USED = ("pair.applied_initiator", "pair.applied_responder")
+"""Counters of contacts that were used."""
 
 
 class InvariantBreach(AssertionError):
@@ -59,6 +66,7 @@ class _Life:
     t_ns: int = -(2**62)
     sent: dict[tuple[str, str | None], int] = field(default_factory=dict)
     contacts: dict[str, Epoch] = field(default_factory=dict)
+    used: set[tuple[str, Epoch]] = field(default_factory=set)
     counted: dict[str, int] = field(default_factory=dict)
     learnt: int = 0
     volume: float = 0.0
@@ -178,6 +186,14 @@ def _contacts(life: _Life) -> Iterable[tuple[str, str]]:
             before = life.contacts.get(peer)
             if before is not None and epoch.met and epoch < before:
                 yield "contacts", f"the last one with {peer} went back from {before} to {epoch}"
+    used = sum(life.node.agent.counters.get(name, 0) - life.counted.get(name, 0) for name in USED)
+    fresh = {item for item in newest.items() if item[1] != life.contacts.get(item[0])}
+    if used and not fresh:
+        yield "once", "the last contact with a peer was used again"
+    again = next(iter(sorted(fresh & life.used)), None)
+    if used and again is not None:
+        yield "once", f"the contact {again[1]} with {again[0]} was used again"
+    life.used |= fresh
     life.contacts = dict(newest)
 
 

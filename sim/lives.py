@@ -73,7 +73,7 @@ class Process:
         boot = hashlib.blake2b(name.encode(), digest_size=7).digest()
         self.node = Node(
             begin.settings,
-            self._config.network.settings(self._config.lateness),
+            self._config.network.settings(self._config.lateness, self._config.unsafe.settings()),
             boot_id=int.from_bytes(boot, "little"),
             incarnation=begin.incarnation,
             software=SOFTWARE,

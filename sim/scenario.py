@@ -24,6 +24,7 @@ from agent.config_parts import (
     CoastPart,
     ControlNoisePart,
     ControlPart,
+    HealthPart,
     IntrinsicsPart,
     LandmarkPart,
     LatenessPart,
@@ -45,6 +46,7 @@ from agent.sensor_input import SensorConfig
 from agent.settings import nanoseconds
 from agent.start_config import StartSource
 from agent.target_parts import TargetModel, TrackingPart, target_motion
+from agent.unsafe_parts import UnsafePart
 
 Subject = Literal["peers", "landmarks", "targets"]
 
@@ -242,6 +244,8 @@ class Scenario(Part):
     tracking: TrackingPart = TrackingPart()
     lateness: LatenessPart = LatenessPart()
     coast: CoastPart = CoastPart()
+    health: HealthPart = HealthPart()
+    unsafe: UnsafePart = UnsafePart()
     network: NetworkPart = NetworkPart()
     state: StatePart = StatePart()
     links: LinksPart = LinksPart()

@@ -62,6 +62,10 @@ def check(scenario: Scenario) -> None:
                 "planar; take 'unicycle'"
             )
         scenario.lateness_of(robot)
+        try:
+            scenario.health.settings(scenario.localization_of(robot).form)
+        except ConfigError as error:
+            raise ConfigError(f"{scenario.name}: {error}") from None
         localization, tracking = scenario.localization_of(robot), scenario.tracking_of(robot)
         try:
             localization.settings()

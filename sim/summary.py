@@ -24,9 +24,15 @@ def reduce(scenario: Scenario, result: TrialResult) -> dict[str, Any]:
         "network": result.network,
         "rejected": result.rejected,
         "nis": result.nis,
-        "repairs": sum(own.get("update.not_positive_definite", 0) for own in result.counters.values()),
+        "repairs": _total(result, "update.not_positive_definite"),
+        "quarantines": [_total(result, "health.quarantined"), _total(result, "health.readmitted")],
         "step_us": result.step_us,
     }
+
+
+def _total(result: TrialResult, name: str) -> int:
+    """A counter of all robots together."""
+    return sum(own.get(name, 0) for own in result.counters.values())
 
 
 def summarize(
@@ -50,6 +56,7 @@ def summarize(
         network.update({key: value for key, value in item["network"].items() if key != "pair"})
         pair.update(item["network"]["pair"])
         rejected.update(item["rejected"])
+    begun, ended = (sum(item["quarantines"][index] for item in reduced) for index in (0, 1))
     seconds = simulated_s * len(reduced) * len(scenario.robots)
     lost = figures.pop("lost")
     return {
@@ -68,8 +75,10 @@ def summarize(
             "pair": {key: pair[key] for key in ("started", "completed", "one_sided", "fallback", "too_old")},
         },
         "rejected": dict(sorted(rejected.items())),
+        "quarantines": {"begun": begun, "ended": ended, "open": begun - ended},
         "covariance_repairs": sum(item["repairs"] for item in reduced),
         "faults": faults(scenario, seed if len(reduced) == 1 else None),
+        "unsafe": scenario.unsafe.settings().named(),
         "exit": exits if exits is not None else {robot.id: 0 for robot in scenario.robots},
         "timing": timing,
     }

@@ -14,7 +14,7 @@ from sim.scenario import Scenario
 
 MAX_VARIANTS = 64
 _UNSAFE = re.compile(r"[^A-Za-z0-9._=,+-]+")
-_IRRELEVANT = ("name", "lost_above_m", "expect", "links", "network", "lateness", "tracking")
+_IRRELEVANT = ("name", "lost_above_m", "expect", "links", "network", "lateness", "tracking", "health", "unsafe")
 """What neither the world nor the centralized filter depends on."""
 
 

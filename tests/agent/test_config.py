@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,9 @@ from agent.config_parts import (
 )
 from agent.estimation.motion import SPATIAL, HeldAltitude, SpatialMotion
 from agent.estimation.observation import Intrinsics, planar_mount
+from agent.settings import AgentSettings, CoastSettings, UnsafeSettings
 from agent.target_parts import target_motion
+from agent.unsafe_parts import UnsafePart
 
 
 def example(**change: Any) -> dict[str, Any]:
@@ -120,7 +123,8 @@ def test_a_team_is_told_of_each_others_starts(tmp_path: Path) -> None:
 
 def test_the_horizon_of_the_history_is_the_age_limit_of_messages() -> None:
     config = validate(AgentConfig, example(), "r1")
-    assert config.network.settings(config.lateness).horizon_ns == round(config.lateness.horizon_s * 1e9)
+    network = config.network.settings(config.lateness, config.unsafe.settings())
+    assert network.horizon_ns == round(config.lateness.horizon_s * 1e9)
 
 
 def test_odometry_noise_is_handed_over_completely() -> None:
@@ -335,3 +339,37 @@ def test_an_autopilot_beyond_loopback_counts_as_real(tmp_path: Path, endpoint: s
 
 def test_a_wrong_mavlink_endpoint_is_told_before_anything_starts(tmp_path: Path) -> None:
     assert "mavlink.endpoint" in complaint(tmp_path, example(mavlink={"endpoint": "udp:14550"}))
+
+
+def test_protections_are_not_switched_off_on_a_robot_that_may_be_real(tmp_path: Path) -> None:
+    unsafe = {"accept_stale": True, "trust_liars": False}
+    real = {"endpoint": "udpin:127.0.0.1:14550"}
+    for mavlink in (real, {"endpoint": "udpin:0.0.0.0:14550", "simulated": True}):
+        assert "unsafe.accept_stale" in complaint(tmp_path, example(mavlink=mavlink, unsafe=unsafe))
+        load_agent_config(write(tmp_path, example(mavlink=mavlink, unsafe={"accept_stale": False})))
+    # Without an autopilot nobody knows what the robot is, unless it is part of a run.
+    bare = {key: value for key, value in example(unsafe=unsafe).items() if key != "mavlink"}
+    assert "unsafe.accept_stale" in complaint(tmp_path, bare)
+    load_agent_config(write(tmp_path, bare | {"clock": {"source": "run"}}))
+    found = load_agent_config(write(tmp_path, example(unsafe=unsafe)))
+    assert found.settings(0).unsafe.named() == ["accept_stale"]
+    assert "unsafe.accept_everything" in complaint(tmp_path, example(unsafe={"accept_everything": True}))
+
+
+def test_switches_change_what_they_name(tmp_path: Path) -> None:
+    def settings(*switches: str) -> AgentSettings:
+        changed = example(unsafe=dict.fromkeys(switches, True), lateness={"clock_sigma_s": 1.0})
+        return load_agent_config(write(tmp_path, changed)).settings(0)
+
+    plain = settings()
+    assert plain.health.enabled and plain.unsafe == UnsafeSettings()
+    assert not settings("trust_liars").health.enabled
+    assert settings("trust_clocks").lateness.clock_sigma_ns == 0 < plain.lateness.clock_sigma_ns
+    assert settings("ignore_gaps").coast == CoastSettings(0.0, 0.0) != plain.coast
+    assert settings("ignore_correlation").localization.correlation == "ignored" != plain.localization.correlation
+    assert len(UnsafeSettings().named()) == 0
+    assert {item.name for item in fields(UnsafeSettings)} == set(UnsafePart.model_fields)
+
+
+def test_health_that_judges_nobody_is_refused(tmp_path: Path) -> None:
+    assert "health.gate_nis" in complaint(tmp_path, example(health={"gate_nis": 5.0}))

@@ -206,7 +206,9 @@ def test_a_new_life_doubles_what_is_claimed_and_starts_from_nothing_in_common() 
 
 
 def seen(peer: str, t_ns: int) -> Observation:
-    return Observation(t_ns, t_ns, "vector", peer, np.array([4.0, 1.0]), np.eye(2) * 0.01, "camera")
+    """Where the peer is, as the other one sees it."""
+    z = np.array([-1.1, -5.2]) if peer == FIRST else np.array([5.3, 0.3])
+    return Observation(t_ns, t_ns, "vector", peer, z, np.eye(2) * 0.01, "camera")
 
 
 def sees(agent: Agent, peer: str, t_ns: int) -> Send | None:
@@ -266,7 +268,7 @@ def test_a_peer_that_tells_no_noise_is_met_without_its_targets() -> None:
     told = story.filter(SECOND).snapshot(FIRST)
     assert isinstance(told, JointSnapshot)
     before = story.filter(FIRST).state.cov
-    item = Measurement("vector", np.array([4.0, 1.0]), np.eye(2))
+    item = Measurement("vector", np.array([-1.0, -5.0]), np.eye(2))
     story.agents[FIRST].handle(received(PairRequest(Epoch(3 * NS, SECOND, 9), (item,), replace(told, noise=None))))
     assert story.agents[FIRST].counters["pair.targets_unused"] == 1
     assert story.agents[FIRST].counters["pair.applied_responder"] == 1
@@ -358,7 +360,7 @@ def test_a_wrong_size_is_counted_and_changes_nothing(wrong: dict[str, object]) -
     told = story.filter(SECOND).snapshot(FIRST)
     assert isinstance(told, JointSnapshot)
     before = story.filter(FIRST).state
-    item = Measurement("vector", np.array([4.0, 1.0]), np.eye(2))
+    item = Measurement("vector", np.array([-1.0, -5.0]), np.eye(2))
     spoiled = replace(told, **wrong)  # type: ignore[arg-type]
     story.agents[FIRST].handle(received(PairRequest(EPOCHS[2], (item,), spoiled)))
     assert story.agents[FIRST].counters["pair.malformed"] == 1

@@ -20,7 +20,8 @@ from agent.estimation.colocalization import resolve_cross
 from agent.estimation.motion import UNICYCLE
 from agent.estimation.observation import RelativeModel
 from agent.events import Tick
-from agent.settings import NS
+from agent.health import Health
+from agent.settings import NS, HealthSettings
 from network.messages import Epoch, PairReply, PairRequest
 from tests.agent.courier import FIRST, SECOND, TINY, Ledger, Letter, Pair, gains_of
 
@@ -158,6 +159,17 @@ class Story:
             self._late = [letter for letter in self._late if letter.source != robot or letter.life == life]
 
 
+class Unwilling(Health):
+    """Refuses a robot's contacts of given seconds."""
+
+    def __init__(self, robot: str, refused: frozenset[tuple[str, int]]) -> None:
+        super().__init__(HealthSettings(), Counter())
+        self._robot, self._refused = robot, refused
+
+    def usable(self, peer: str, t_ns: int, nis: float, own_observed: bool) -> bool:
+        return (self._robot, round(t_ns / NS)) not in self._refused
+
+
 def claimed_cross(request: PairRequest, reply: PairReply, initiator: str) -> Array:
     """P_ij (i the initiator) as both robots recover it."""
     assert reply.snapshot is not None
@@ -169,8 +181,13 @@ def claimed_cross(request: PairRequest, reply: PairReply, initiator: str) -> Arr
     return cross if initiator == FIRST else cross.T
 
 
-def run(fates: tuple[str, ...], first: str, second: str) -> Story:
+def run(
+    fates: tuple[str, ...], first: str, second: str, refused: frozenset[tuple[str, int]] = frozenset()
+) -> Story:
+    """`refused`: robots that do not use their contacts of a second, the peer being in quarantine."""
     story = Story(fates)
+    for name, agent in story.pair.agents.items():
+        agent.health = agent.filter._pairs._health = Unwilling(name, refused)  # type: ignore[attr-defined]
     story.step()
     story.contact(WHO[first])
     story.step()
@@ -307,3 +324,19 @@ def test_a_repeated_request_completes_the_contact_exactly(lost: tuple[str, ...])
     story.travel(again)
     assert sorted(robot for _, robot in story.applied) == [FIRST, SECOND]
     assert_books_exact(story, f"repeated after {lost}")
+
+
+@pytest.mark.parametrize("second", WHO)
+@pytest.mark.parametrize("first", WHO)
+def test_contacts_unused_in_quarantine_keep_the_books_exact(first: str, second: str) -> None:
+    seats = [(FIRST, 1), (SECOND, 1), (FIRST, 3), (SECOND, 3)]
+    unused = 0
+    for chosen in product((False, True), repeat=len(seats)):
+        refused = frozenset(seat for seat, taken in zip(seats, chosen) if taken)
+        for fates in product(("now", "late", "lost"), repeat=2):
+            story = run(fates, first, second, refused)
+            note = f"{first}, {second}, {fates}, refused {sorted(refused)}"
+            assert_books_exact(story, note)
+            assert not any((robot, round(epoch.t_meas_ns / NS)) in refused for epoch, robot in story.applied), note
+            unused += bool(refused) and len(story.applied) < 4
+    assert unused

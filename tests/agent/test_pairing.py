@@ -106,6 +106,20 @@ def test_a_repeated_request_gets_the_same_reply_and_is_not_applied_again() -> No
     assert pair.requested(request(LOW, NS // 2), asked.epoch) is Step.ANSWER_SUPERSEDED
 
 
+def test_nothing_up_to_a_contact_refused_as_inconsistent_is_applied_later() -> None:
+    pair = exchange(HIGH)
+    for k in (2, 3):
+        asked = request(LOW, k * NS)
+        assert pair.requested(asked, NEVER) is Step.APPLY
+        pair.answered(PairReply(asked.epoch, ReplyStatus.INCONSISTENT))
+    again = exchange(HIGH)
+    again.restore(pair.saved())
+    for one in (pair, again):
+        for t_ns in (NS, 2 * NS):
+            assert one.requested(request(LOW, t_ns), NEVER) is Step.ANSWER_INCONSISTENT
+        assert one.requested(request(LOW, 4 * NS), NEVER) is Step.APPLY
+
+
 def test_an_unanswered_request_is_repeated_until_it_is_too_old() -> None:
     pair = exchange(LOW)
     own = opened(pair, NS)

@@ -132,7 +132,7 @@ def test_a_peer_that_keeps_restarting_cannot_inflate_us_without_limit() -> None:
     for life in range(1, 12):
         subject.handle(LinkChange(NS, SECOND, True, life, life))
         epoch = Epoch(NS, SECOND, life)
-        item = Measurement("bearing", np.array([0.2]), np.array([[0.01]]))
+        item = Measurement("bearing", np.array([-2.0]), np.array([[0.01]]))
         peer = pair.agents[SECOND].filter.snapshot(FIRST)
         fresh = replace(peer, base=Epoch(), factor=np.zeros((3, 0)), line=np.eye(3), lines=())
         subject.handle(told(PairRequest(epoch, (item,), fresh), life))

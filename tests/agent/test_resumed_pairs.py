@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from agent.core import Agent
 from agent.effects import Persist, Send
 from agent.events import LinkChange, Observation, Received
-from agent.settings import NS, CoastSettings
+from agent.saved_state import begun_again
+from agent.settings import NS, CoastSettings, UnsafeSettings
 from network.messages import Header, Message, PairReply, PairRequest
 from tests.agent.courier import FIRST, SECOND, Letter, Pair
-from tests.agent.test_pair_interleavings import FATES, OTHER, STARTS, WHO, Story, assert_books_exact
+from tests.agent.test_pair_interleavings import FATES, OTHER, STARTS, WHO, Story, Unwilling, assert_books_exact
 
 Array = NDArray[np.float64]
 
@@ -115,6 +116,34 @@ def test_the_books_stay_exact_through_a_kill(first: str, again: str, robot: str)
             assert agent.counters["pair.restarts"] == agent.counters["pair.fallback"] == 0, note
 
 
+@pytest.mark.parametrize("order", ["refusal first", "repetition first"])
+def test_a_contact_refused_as_inconsistent_stays_refused_through_a_kill(order: str) -> None:
+    """The refusal is late, and the request is repeated to a life that would use it, when the line may be gone."""
+    story = KilledStory(("now", "now", "now", "late"), timeout_s=1.0)
+    story.step()
+    story.contact((FIRST,))
+    story.step()
+    story.step()
+    responder = story.pair.agents[SECOND]
+    responder.filter._pairs._health = Unwilling(SECOND, frozenset({(SECOND, 3)}))  # type: ignore[attr-defined]
+    story.contact((FIRST,))
+    assert responder.counters["pair.request_apply"] == 2 and len(story.applied) == 2
+    again = story.step()
+    assert [letter.destination for letter in again] == [SECOND]
+    story.killed(SECOND)
+    answers = story._handed(again[0]) if order == "repetition first" else []
+    story.late()
+    for letter in answers or story._handed(again[0]):
+        story.travel([letter])
+    assert story.pair.agents[SECOND].counters["pair.request_answer_inconsistent"] == 1
+    assert len(story.applied) == 2
+    story.learn()
+    story.step()
+    story.contact((FIRST,))
+    assert len(story.applied) == 4
+    assert_books_exact(story, order)
+
+
 def test_a_file_older_than_the_last_message_is_noticed_by_the_pair() -> None:
     """Why states are written first: with an older one the correlation is lost, and both double what they claim."""
     story = KilledStory(())
@@ -169,3 +198,23 @@ def test_fifty_starts_in_a_minute_inflate_a_peer_no_further() -> None:
         # It meets the peer each time: there is something to forget.
         peer.filter.state = peer.filter.state.with_base(FIRST, peer.filter.state.pair(FIRST).base, np.eye(3), np.eye(3))
     assert float(np.max(np.diagonal(peer.filter.state.cov) / np.diagonal(before))) <= 2.0 + 1e-9
+
+
+def test_who_does_not_save_first_or_trusts_restarts_is_not_protected() -> None:
+    """What the switches of `[unsafe]` take away: the state before the message, and the bound of a new life."""
+    pair = Pair(STARTS)
+    unsafe = UnsafeSettings(send_before_saving=True, trust_restarts=True)
+    pair.agents = {name: Agent(replace(agent.settings, unsafe=unsafe)) for name, agent in pair.agents.items()}
+    for name in STARTS:
+        pair.odometry(name, 0, NS, np.array([0.3, 0.1, 0.0, 0.0]), np.diag([0.01, 0.02, 0.0, 0.0]))
+        pair.tell_life(name, OTHER[name])
+    effects = pair.agents[FIRST].handle(Observation(NS, NS, "range", SECOND, np.array([6.1]), np.array([[0.01]]), "s"))
+    assert not any(isinstance(effect, Persist) and effect.ahead for effect in effects)
+    pair.converse([Letter(FIRST, SECOND, NS, item.body) for item in effects if isinstance(item, Send)])
+    before = pair.agents[FIRST].filter.state.cov
+    pair.lives[SECOND] += 1
+    pair.tell_life(SECOND, FIRST)
+    assert pair.agents[FIRST].counters["pair.restarts"] == 1
+    np.testing.assert_array_equal(pair.agents[FIRST].filter.state.cov, before)
+    again = begun_again(pair.agents[SECOND].settings)
+    np.testing.assert_array_equal(again.cov, STARTS[SECOND][1])

@@ -63,7 +63,7 @@ class TwinTeam(Team):
             z = np.array([rng.normal(), rng.normal()]) + 2.0
             self.handle(name, Observation(now, now, "vector", "target:t1", z, np.eye(2) * 0.3, "camera"))
         first, second = rng.permutation(names)[:2]
-        self.handle(first, Observation(now, now, "vector", second, rng.normal(size=2) + 3.0, np.eye(2) * 0.2, "camera"))
+        self.handle(first, Observation(now, now, "vector", second, rng.normal(size=2) + 3.0, np.eye(2) * 9.0, "camera"))
         self.converse()
         self.handle(first, Fix(now, now, "position", rng.normal(size=2), np.eye(2), "gps"))
 
@@ -98,6 +98,7 @@ def test_with_factors_it_does_the_same_for_twenty_seconds_bit_for_bit(form: str,
     twin._published, twin._tracks = twin.filter.revision, team.agents[robot]._tracks
     assert twin.saved() == payload
     assert twin.filter.contacts() == team.agents[robot].filter.contacts() != {}
+    assert twin.health.saved() == team.agents[robot].health.saved() != {}
     for _ in range(20):
         team.second(rng)
     assert team.compared > 60

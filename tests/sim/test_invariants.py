@@ -13,6 +13,7 @@ from agent.core import Agent
 from agent.effects import Estimate
 from agent.estimation.split_joint import Split
 from agent.node import Node
+from agent.split_filter import SplitFilter
 from network.endpoint import Endpoint
 from network.messages import Epoch
 from sim.engine import VirtualEngine
@@ -164,6 +165,21 @@ def test_a_contact_that_is_applied_out_of_turn(monkeypatch: pytest.MonkeyPatch) 
         return {peer: replace(epoch, t_meas_ns=epoch.t_meas_ns - call) for peer, epoch in found.items()}
 
     assert broken(monkeypatch, FactorFilter, "contacts", earlier, "safe") == "contacts"
+
+
+@pytest.mark.parametrize("last", [False, True])
+def test_a_contact_that_is_used_again(monkeypatch: pytest.MonkeyPatch, last: bool) -> None:
+    """The newest one with its peer, or an earlier one."""
+    kept: list[Any] = []
+
+    def again(real: Callable[..., Any], call: int, self: SplitFilter, *arguments: Any, **keywords: Any) -> None:
+        own = [item for item in kept if item[0] is self]
+        if call > 30 and own:
+            _, arguments, keywords = own[-1 if last else 0]
+        kept.append((self, arguments, keywords))
+        real(self, *arguments, **keywords)
+
+    assert broken(monkeypatch, SplitFilter, "_apply", again, "split_joint") == "once"
 
 
 def test_a_new_life_begins_anew() -> None:

@@ -32,8 +32,8 @@ def summary() -> dict[str, Any]:
 def test_the_keys_of_schema_1(summary: dict[str, Any]) -> None:
     assert {
         "schema", "scenario", "runtime", "seed", "trials", "lost", "window_s", "simulated_s", "robots", "targets",
-        "fleet", "all", "median", "bound", "network", "series", "rejected", "covariance_repairs", "faults", "exit",
-        "timing",
+        "fleet", "all", "median", "bound", "network", "series", "rejected", "covariance_repairs", "quarantines",
+        "faults", "unsafe", "exit", "timing",
     } <= summary.keys()  # fmt: skip
     assert {
         "position_rmse_m", "heading_rmse_rad", "position_error_max_m", "final_position_error_m", "anees",

@@ -1,0 +1,33 @@
+"""The live table of a run says whose contacts are not used, why and until when."""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from types import SimpleNamespace
+from typing import Any
+
+from rich.console import Console
+
+from agent.health import Health
+from agent.settings import NS, HealthSettings
+from deploy.status import LiveTable
+from sim.scenario_file import load
+
+
+def test_a_quarantine_is_told_with_its_reason_and_its_end() -> None:
+    health = Health(HealthSettings(), Counter())
+    for k in range(5):
+        health.usable("r1", k * NS, 20.0, own_observed=False)
+    status: dict[str, Any] = {"x_m": 1.0, "y_m": 2.0, "sigma_m": 0.3, "lag_s": 0.0, "peers": {"r1": True, "r3": True}}
+    told = SimpleNamespace(exit_code=None, status={**status, "health": health.status(13 * NS)})
+    plain = SimpleNamespace(exit_code=None, status={**status, "health": Health(HealthSettings(), Counter()).status(0)})
+    launcher = SimpleNamespace(members={"r2": told, "r3": plain}, progress=lambda: 0.5, injected=lambda: ["loss 0.5"])
+    console = Console(file=io.StringIO(), width=200)
+    console.print(LiveTable(load("liar", ["unsafe.accept_stale=true"]), 1.0, quiet=True).table(launcher))  # type: ignore[arg-type]
+    assert isinstance(console.file, io.StringIO)
+    shown = " ".join(console.file.getvalue().split())
+    assert shown.count("r1 (quarantined) r3") == 1
+    assert "UNSAFE: accept_stale injected: range_m 60, hysteresis_m 2, loss 0.5" in shown
+    assert "r2: r1 is quarantined for 10 s: mean NIS of its contacts was 12.0" in shown
+    assert "consistent ones have 1; until 8 contacts in a row" in shown
