@@ -20,7 +20,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.cooperative_filter import CooperativeFilter
+from agent.cooperative_filter import CooperativeFilter, FilterMark
 from agent.effects import Effect, Estimate
 from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.estimation.split_joint import Split
@@ -129,6 +129,12 @@ class AutoFilter:
     def sighting(self, t_ns: int, target: str, event: Observation) -> None:
         self._active.sighting(t_ns, target, event)
         self._check_linearity()
+
+    def mark(self) -> FilterMark | None:
+        return self._active.mark()
+
+    def rewind(self, mark: FilterMark) -> None:
+        self._active.rewind(mark)
 
     # -- which form is on -----------------------------------------------------------------------------------
 

@@ -69,6 +69,13 @@ class ReplicaFilter:
     def revision(self) -> object:
         return self._revision
 
+    def mark(self) -> FilterMark | None:
+        """The team has been told: nothing is taken back. What was measured is put in its place by the history."""
+        return None
+
+    def rewind(self, mark: FilterMark) -> None:
+        raise RuntimeError("there is no mark of this filter")
+
     def estimate(self) -> Estimate:
         belief, robot = self._history.belief(), self._settings.robot
         if self._told_of[0] is belief:

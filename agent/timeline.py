@@ -41,29 +41,47 @@ class Item:
     event: Fix | Observation | Received
 
 
-class Timeline:
-    """A bounded heap of items ordered by (instant, phase, source, arrival)."""
+ItemKey = tuple[int, Phase, str, str, str, bytes, bytes]
+"""Order of items, and what tells two of them apart, whenever they arrive."""
 
-    def __init__(self) -> None:
-        self._heap: list[tuple[int, Phase, str, int, Item]] = []
+Gap = tuple[int, int] | None
+"""Where a gap of the odometry began, and how far it was coasted over."""
+
+
+def item_key(item: Item) -> ItemKey:
+    """(instant, phase, source, sensor, kind, z, R) of an own datum; what a message tells is not looked at."""
+    event = item.event
+    if isinstance(event, Received):
+        return item.t_ns, item.phase, item.source, "", "", b"", b""
+    return item.t_ns, item.phase, item.source, event.sensor, event.kind, event.z.tobytes(), event.R.tobytes()
+
+
+class Timeline:
+    """A bounded heap of items ordered by (instant, phase, source, then what they are or when they arrived)."""
+
+    def __init__(self, by_content: bool = False) -> None:
+        self._by_content = by_content
+        self._heap: list[tuple[ItemKey, int, Item]] = []
         self._arrivals = 0
 
     def __len__(self) -> int:
         return len(self._heap)
 
-    def push(self, item: Item) -> bool:
-        """Add an item; False when the heap is full."""
-        if len(self._heap) >= MAX_WAITING:
-            return False
+    @property
+    def full(self) -> bool:
+        return len(self._heap) >= MAX_WAITING
+
+    def push(self, item: Item) -> None:
+        """Add an item; ask `full` before, unless it has been in here already."""
         self._arrivals += 1
-        heapq.heappush(self._heap, (item.t_ns, item.phase, item.source, self._arrivals, item))
-        return True
+        key = item_key(item) if self._by_content else (item.t_ns, item.phase, item.source, "", "", b"", b"")
+        heapq.heappush(self._heap, (key, self._arrivals, item))
 
     def peek(self) -> Item | None:
-        return self._heap[0][4] if self._heap else None
+        return self._heap[0][2] if self._heap else None
 
     def pop(self) -> Item:
-        return heapq.heappop(self._heap)[4]
+        return heapq.heappop(self._heap)[2]
 
 
 class OdometryTrack:
@@ -72,10 +90,35 @@ class OdometryTrack:
     def __init__(self, coast: CoastSettings, tolerance_ns: int, counters: Counter[str]) -> None:
         self._coast, self._tolerance_ns, self._counters = coast, tolerance_ns, counters
         self._increments: deque[Odometry] = deque()
-        self._gap_ns: tuple[int, int] | None = None
+        self._gap_ns: Gap = None
 
     def __len__(self) -> int:
         return len(self._increments)
+
+    @property
+    def head(self) -> Odometry | None:
+        """The first waiting increment, or what is left of it."""
+        return self._increments[0] if self._increments else None
+
+    @property
+    def gap_ns(self) -> Gap:
+        return self._gap_ns
+
+    def restore(self, head: Odometry | None, gap_ns: Gap, increments: list[Odometry]) -> None:
+        """Go back to where `head` was the first, with all `increments` that end later than the state, in order."""
+        self._increments.clear()
+        self._gap_ns = gap_ns
+        for item in increments[-MAX_INCREMENTS:]:
+            same = head is not None and item.t_meas_ns == head.t_meas_ns
+            self._increments.append(head if same and head is not None else item)
+
+    def put(self, odometry: Odometry) -> None:
+        """Take an increment in the order of their ends; it is of what was not used yet, and there is room for it."""
+        later = []
+        while self._increments and self._increments[-1].t_meas_ns > odometry.t_meas_ns:
+            later.append(self._increments.pop())
+        self._increments.append(odometry)
+        self._increments.extend(reversed(later))
 
     def copy(self) -> OdometryTrack:
         """A track of its own with the same increments."""

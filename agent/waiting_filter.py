@@ -162,6 +162,13 @@ class WaitingFilter:
 
     # -- for people -----------------------------------------------------------------------------------------
 
+    def mark(self) -> FilterMark | None:
+        """There is no estimate that could be made again."""
+        return None
+
+    def rewind(self, mark: FilterMark) -> None:
+        raise RuntimeError("there is no mark of this filter")
+
     def estimate(self) -> Estimate | None:
         return None
 
