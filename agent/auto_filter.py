@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,10 +132,14 @@ class AutoFilter:
         self._check_linearity()
 
     def mark(self) -> FilterMark | None:
-        return self._active.mark()
+        kept = self._active.mark()
+        return None if kept is None else FilterMark(self, (self._joint, self._active, self._why, kept))
 
     def rewind(self, mark: FilterMark) -> None:
-        self._active.rewind(mark)
+        """A hand-over because of what was measured is taken back with it."""
+        kept = cast("tuple[JointFilter | None, CooperativeFilter, str, FilterMark]", mark.kept)
+        self._joint, self._active, self._why, before = kept
+        self._active.rewind(before)
 
     # -- which form is on -----------------------------------------------------------------------------------
 

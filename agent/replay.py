@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from agent.cooperative_filter import FilterMark
 from agent.events import Odometry
 from agent.settings import NS
-from agent.timeline import MAX_INCREMENTS, Gap, Item, ItemKey, OdometryTrack, item_key
+from agent.timeline import MAX_INCREMENTS, Gap, Item, ItemKey, OdometryTrack, Phase, item_key
 
 MAX_LOGGED = 4096
 MAX_MARKS = 2048
@@ -33,11 +33,20 @@ MAX_ALLOWANCE = 4096
 
 @dataclass(slots=True, eq=False)
 class Record:
-    """An own datum, and when it was used last, counted in uses (None: not yet)."""
+    """An own datum.
+
+    used      the number of its last use, of all uses; None: it is to be used, for the first time or again
+    waiting   it is in the timeline
+    counted   it was used before, and stands in the figures
+    late      it came after its place in the order
+    """
 
     key: ItemKey
     item: Item
     used: int | None = None
+    waiting: bool = True
+    counted: bool = False
+    late: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,39 +85,57 @@ class ReplayLog:
 
     # -- data -----------------------------------------------------------------------------------------------
 
-    def take(self, item: Item) -> bool:
-        """A new own datum; False, counted, if it is too old, or known already."""
-        if item.t_ns <= self._floor_ns:
+    def take(self, item: Item, state_ns: int) -> bool:
+        """A new own datum; whether it belongs into the timeline.
+
+        Otherwise it waits here for a rewind, or it is counted: too old, or known already.
+        """
+        if item.t_ns <= max(self._floor_ns, state_ns - self._horizon_ns):
             self._counters["late.too_old"] += 1
             return False
         record = Record(item_key(item), item)
-        index = bisect_left(self._records, record.key, key=_key)
-        if index < len(self._records) and self._records[index].key == record.key:
+        if self._find(record.key) is not None:
             self._counters["input.duplicate"] += 1
             return False
-        self._records.insert(index, record)
-        if len(self._records) > MAX_LOGGED:
+        if len(self._records) >= MAX_LOGGED:
             self._counters["replay.horizon_cut"] += 1
             self._forget(self._records[MAX_LOGGED // 16].item.t_ns)
-        return item.t_ns > self._floor_ns
-
-    def late(self, item: Item, state_ns: int) -> bool:
-        """Whether a datum belongs before something that has been used since the last contact, or before the state."""
-        if not self._marks:
+        if len(self._records) >= MAX_LOGGED or item.t_ns <= self._floor_ns:
+            self._counters["input.overflow"] += 1
             return False
-        key = item_key(item)
-        return item.t_ns < state_ns - self._tolerance_ns or (self._last is not None and key < self._last)
+        insort(self._records, record, key=_key)
+        if item.phase is Phase.PAIR:
+            # What is measured of a peer opens a contact, which is not done again; it is only to be told from its copies.
+            record.used, record.waiting = 0, False
+            return True
+        before_another = self._last is not None and record.key < self._last
+        if self._marks and (before_another or item.t_ns < state_ns - self._tolerance_ns):
+            record.waiting, record.late = False, True
+            self.disturbed(item.t_ns)
+        return record.waiting
+
+    def drop(self, item: Item) -> None:
+        """There is no room for it in the timeline."""
+        found = self._find(item_key(item))
+        if found is not None:
+            self._records.remove(found)
+
+    def _find(self, key: ItemKey) -> Record | None:
+        index = bisect_left(self._records, key, key=_key)
+        known = index < len(self._records) and self._records[index].key == key
+        return self._records[index] if known else None
 
     def used(self, item: Item) -> bool:
         """The datum is about to be used; whether it was before."""
         self._uses += 1
-        key = item_key(item)
-        index = bisect_left(self._records, key, key=_key)
-        if index == len(self._records) or self._records[index].key != key:
+        record = self._find(item_key(item))
+        if record is None:
             return False
-        before, self._records[index].used = self._records[index].used, self._uses
-        self._last = key if self._last is None else max(self._last, key)
-        return before is not None
+        before, record.used, record.waiting, record.counted = record.counted, self._uses, False, True
+        if record.late and not before:
+            self._counters["late.replayed"] += 1
+        self._last = record.key if self._last is None else max(self._last, record.key)
+        return before
 
     def odometry(self, odometry: Odometry) -> int | None:
         """A new increment; returns since when the motion is another one by it. None, counted, if it is of no use."""
@@ -131,6 +158,14 @@ class ReplayLog:
             self._forget(self._ends[MAX_INCREMENTS // 16][0])
         return odometry.t0_ns if index == 0 else max(odometry.t0_ns, self._ends[index - 1][0])
 
+    def moved_late(self, odometry: Odometry, since_ns: int) -> None:
+        """An increment is of a stretch the state has gone through already, from `since_ns` on."""
+        if not self._marks or odometry.t_meas_ns <= self._marks[0].t_ns + self._tolerance_ns:
+            self._counters["late.odometry_unused"] += 1
+            return
+        self._counters["late.odometry_replayed"] += 1
+        self.disturbed(since_ns)
+
     def settle(self, state_ns: int) -> None:
         """The state has come to `state_ns`: forget what lies beyond the horizon."""
         oldest = state_ns - self._horizon_ns
@@ -139,36 +174,39 @@ class ReplayLog:
             self._forget(oldest)
 
     def _forget(self, until_ns: int) -> None:
+        """Take nothing up to an instant any more, and forget what no rewind to a later one needs."""
         self._floor_ns = max(self._floor_ns, until_ns)
-        count = bisect_right(self._records, self._floor_ns, key=lambda record: record.item.t_ns)
-        self._counters["late.too_old"] += sum(record.used is None for record in self._records[:count])
-        del self._records[:count]
-        count = bisect_right(self._ends, (self._floor_ns, self._floor_ns))
+        first = bisect_right(self._marks, self._floor_ns, key=_instant) - 1
+        del self._marks[: max(first, 0)]
+        uses = self._marks[0].uses if self._marks else self._uses
+        kept = []
+        for record in self._records:
+            over = record.item.t_ns <= self._floor_ns and not record.waiting
+            if over and record.used is None:
+                self._counters["late.too_old"] += 1
+            elif not over or (record.used is not None and record.used > uses):
+                kept.append(record)
+        self._records = kept
+        ended_ns = min(self._floor_ns, self._marks[0].t_ns) if self._marks else self._floor_ns
+        count = bisect_right(self._ends, ended_ns, key=lambda end: end[0])
         del self._ends[:count], self._increments[:count]
-        # What is forgotten can't be used again: the first mark is one after it.
-        first = bisect_left(self._marks, self._floor_ns, key=lambda mark: mark.t_ns)
-        del self._marks[: min(first, len(self._marks) - 1)]
 
     # -- marks ----------------------------------------------------------------------------------------------
 
     @property
-    def can_rewind(self) -> bool:
-        """Whether there is anything to go back to."""
-        return bool(self._marks)
-
-    @property
-    def first_ns(self) -> int:
-        """The earliest instant that can be gone back to, if there is one."""
-        return self._marks[0].t_ns
+    def first_ns(self) -> int | None:
+        """The earliest instant there is a mark of."""
+        return self._marks[0].t_ns if self._marks else None
 
     def mark(self, t_ns: int, found: FilterMark | None, track: OdometryTrack) -> None:
-        """The filter is about to leave an instant."""
+        """The filter is about to leave an instant, or what was used up to now is not to be used again."""
+        if found is None or (self._marks and self._marks[-1].filter.owner is not found.owner):
+            # Another filter is on: what the one before knew is gone.
+            self._marks.clear()
         if found is None:
-            self._marks.clear()
             return
-        if self._marks and self._marks[-1].filter.owner is not found.owner:
-            # Another form is on: what the one before knew is gone.
-            self._marks.clear()
+        if self._marks and (self._marks[-1].t_ns, self._marks[-1].uses) == (t_ns, self._uses):
+            return
         self._marks.append(Mark(t_ns, self._uses, found, track.head, track.gap_ns))
         if len(self._marks) > MAX_MARKS:
             self._counters["replay.horizon_cut"] += 1
@@ -201,30 +239,35 @@ class ReplayLog:
         self._allowance = min(self._allowance + gained, float(MAX_ALLOWANCE))
         self._allowed_ns = max(now_ns, self._allowed_ns)
 
-    def rewound(self, now_ns: int, owner: object) -> tuple[Mark, list[Item], list[Odometry]] | None:
-        """What to go back to, and the data and odometry to use after it; None: not now, or not at all.
-
-        `owner`: the filter that is on.
-        """
-        if self._dirty_ns is None or self.due_ns(now_ns) > now_ns:
+    def rewound(self, now_ns: int, state_ns: int) -> tuple[Mark, list[Item], list[Odometry]] | None:
+        """What to go back to from `state_ns`, and the data and odometry to use after it; None: not now."""
+        if self._dirty_ns is None or not self._marks or self.due_ns(now_ns) > now_ns:
             return None
-        if not self._marks or self._marks[-1].filter.owner is not owner:
-            return None
-        # With the tolerance, data after the mark's instant may have been used at it.
-        index = bisect_left(self._marks, self._dirty_ns - self._tolerance_ns, key=lambda mark: mark.t_ns) - 1
-        mark = self._marks[max(index, 0)]
-        again = [record for record in self._records if record.used is None or record.used > mark.uses]
-        done = sum(record.used is not None for record in again) + len(self._marks) - max(index, 0)
-        self._allowance -= 1 + done
+        # With the tolerance, data after a mark's instant may have been used at it.
+        before = bisect_left(self._marks, self._dirty_ns - self._tolerance_ns, key=_instant) - 1
+        kept_by_filter = bisect_right(self._marks, state_ns - self._horizon_ns, key=_instant) - 1
+        index = max(before, kept_by_filter, 0)
+        mark = self._marks[index]
+        again, self._last = [], None
+        for record in self._records:
+            if record.used is not None and record.used <= mark.uses:
+                self._last = record.key if record.used and index > 0 else self._last
+            elif not record.waiting:
+                record.used, record.waiting = None, True
+                again.append(record)
+        steps = sum(record.counted for record in again) + len(self._marks) - index
+        self._allowance -= steps
         self._counters["replay.rewinds"] += 1
-        self._counters["replay.steps"] += done
-        del self._marks[max(index, 0) + 1 :]
+        self._counters["replay.steps"] += steps
+        del self._marks[index + 1 :]
         self._dirty_ns = None
-        before = [record.key for record in self._records if record.used is not None and record.used <= mark.uses]
-        self._last = before[-1] if before and index > 0 else None
         first = bisect_right(self._ends, mark.t_ns, key=lambda end: end[0])
         return mark, [record.item for record in again], self._increments[first:]
 
 
 def _key(record: Record) -> ItemKey:
     return record.key
+
+
+def _instant(mark: Mark) -> int:
+    return mark.t_ns

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.cooperative_filter import FilterMark
 from agent.effects import Broadcast, Effect, Estimate, TrackEstimate
 from agent.estimation.observation import AbsoluteModel, RelativeModel, levelled, told
 from agent.events import LinkChange, Observation, Received

@@ -67,15 +67,14 @@ class Timeline:
     def __len__(self) -> int:
         return len(self._heap)
 
-    @property
-    def full(self) -> bool:
-        return len(self._heap) >= MAX_WAITING
-
-    def push(self, item: Item) -> None:
-        """Add an item; ask `full` before, unless it has been in here already."""
+    def push(self, item: Item, again: bool = False) -> bool:
+        """Add an item; False when the heap is full, unless it is one that was in it before and comes `again`."""
+        if len(self._heap) >= MAX_WAITING and not again:
+            return False
         self._arrivals += 1
         key = item_key(item) if self._by_content else (item.t_ns, item.phase, item.source, "", "", b"", b"")
         heapq.heappush(self._heap, (key, self._arrivals, item))
+        return True
 
     def peek(self) -> Item | None:
         return self._heap[0][2] if self._heap else None
@@ -113,7 +112,10 @@ class OdometryTrack:
             self._increments.append(head if same and head is not None else item)
 
     def put(self, odometry: Odometry) -> None:
-        """Take an increment in the order of their ends; it is of what was not used yet, and there is room for it."""
+        """Take an increment in the order of their ends; it is of what was not used yet."""
+        if len(self._increments) >= MAX_INCREMENTS:
+            self._counters["odometry.overflow"] += 1
+            self._increments.popleft()
         later = []
         while self._increments and self._increments[-1].t_meas_ns > odometry.t_meas_ns:
             later.append(self._increments.pop())

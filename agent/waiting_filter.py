@@ -7,6 +7,7 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.cooperative_filter import FilterMark
 from agent.effects import Effect, Estimate, Send
 from agent.estimation.motion import STATES
 from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, RelativeModel
