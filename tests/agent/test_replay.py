@@ -87,7 +87,7 @@ def rank(event: Event) -> tuple[int, int, str, str, str, bytes]:
 
 
 def story(seed: int) -> list[Event]:
-    """Odometry and measurements over two seconds, in order: at the odometry's instants, between them, several at once."""
+    """Odometry and measurements over two seconds, in order; measurements between its instants, at them, and together."""
     rng = np.random.default_rng(seed)
     events: list[Event] = [odometry(k) for k in range(END_NS // STEP_NS)]
     for _ in range(16):
