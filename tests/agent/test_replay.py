@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 
 from agent.core import Agent
 from agent.estimation.motion import LAYOUTS, TargetMotion
-from agent.events import Event, Fix, Observation, Odometry, Tick
+from agent.events import Event, Fix, Observation, Odometry, Received, Tick
 from agent.replay import MAX_ALLOWANCE, MAX_LOGGED, STEPS_PER_S
 from agent.settings import NS, AgentSettings, LatenessSettings, LocalizationSettings, TargetSettings, TeamMember
+from network.messages import Header, Message
+from tests.agent.courier import sends
 
 MS = 1_000_000
 STEP_NS = 100 * MS
@@ -232,3 +234,88 @@ def test_data_beyond_what_the_log_holds_cut_the_horizon_short() -> None:
     assert all(size <= bound for size, bound in subject.sizes().values())
     assert subject.counters["replay.horizon_cut"] >= 1
     assert subject.counters["late.too_old"] + subject.counters["input.overflow"] >= 10
+
+
+# --- across contacts ---------------------------------------------------------------------------------------------
+
+
+class Two:
+    """Robots `r1` and `r2` of one form; only `r1` has data of its own. Contacts are at 1.0 s, by a range of `r1`."""
+
+    def __init__(self, form: str, kind: Kind) -> None:
+        self.own = agent(form, kind)
+        other = replace(self.own.settings, robot="r2", mean=np.array([4.0, 3.0, 0.1]))
+        self.peer, self.sent, self._seq = Agent(other), 0, 0
+
+    def own_event(self, event: Event, now_ns: int) -> None:
+        """An event for `r1`; what comes of it is carried between both until nothing is left to say."""
+        letters = [("r1", item) for item in sends(self.own.handle(replace(event, t_ns=now_ns)))]
+        while letters:
+            source, letter = letters.pop(0)
+            self.sent, self._seq = self.sent + 1, self._seq + 1
+            header = Header(source, 1, 1, self._seq, letter.t_meas_ns, now_ns)
+            receiver = self.peer if source == "r1" else self.own
+            event = Received(now_ns, Message(header, letter.body))
+            name = "r2" if source == "r1" else "r1"
+            letters += [(name, item) for item in sends(receiver.handle(event))]
+
+    def drive(self, first: int, last: int) -> None:
+        for k in range(first, last):
+            now_ns = (k + 1) * STEP_NS
+            self.peer.handle(odometry(k))
+            self.own_event(odometry(k), now_ns)
+
+    def meet(self) -> None:
+        found = Observation(NS, NS, "range", "r2", np.array([3.3]), np.array([[0.01]]), "uwb")
+        self.own_event(found, NS)
+
+
+def fix(t_ns: int, seed: int) -> Event:
+    return measured(t_ns, "position", "gps", np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_contact_ends_what_is_done_again_and_is_told_once(form: str) -> None:
+    """What is earlier than a contact is used as a delayed update right after it, and all later data are used again."""
+    timely = Two(form, "compensate")
+    timely.drive(0, 10)
+    timely.meet()
+    timely.own_event(fix(550 * MS, 1), NS)
+    timely.drive(10, 14)
+    timely.own_event(fix(1400 * MS, 2), 1400 * MS)
+    timely.own_event(measured(1400 * MS, "range", "landmark:L1", np.random.default_rng(3)), 1400 * MS)
+    timely.drive(14, 18)
+    timely.own_event(fix(1800 * MS, 4), 1800 * MS)
+    timely.drive(18, 20)
+
+    late = Two(form, "replay")
+    late.drive(0, 10)
+    late.meet()
+    late.drive(10, 14)
+    late.own_event(measured(1400 * MS, "range", "landmark:L1", np.random.default_rng(3)), 1400 * MS)
+    late.drive(14, 18)
+    late.own_event(fix(1800 * MS, 4), 1800 * MS)
+    late.drive(18, 20)
+    late.own_event(fix(1400 * MS, 2), END_NS)
+    late.own_event(fix(550 * MS, 1), END_NS)
+    late.own_event(fix(550 * MS, 1), END_NS)
+
+    assert timely.own.counters["pair.applied_initiator"] == late.own.counters["pair.applied_initiator"] == 1
+    assert timely.sent == late.sent == 2
+    assert_same_estimate(timely.own, late.own)
+    assert late.own.counters["late.compensated"] == 1
+    assert late.own.counters["late.replayed"] == 2
+    assert late.own.counters["input.duplicate"] == 1
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_odometry_from_before_a_contact_is_counted_and_not_used(form: str) -> None:
+    two = Two(form, "replay")
+    two.drive(0, 5)
+    two.drive(6, 10)
+    two.meet()
+    two.drive(10, 12)
+    before = two.own.filter.revision
+    two.own_event(odometry(5), 1200 * MS)
+    assert two.own.counters["late.odometry_unused"] == 1
+    assert two.own.filter.revision is before
