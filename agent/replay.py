@@ -105,7 +105,7 @@ class ReplayLog:
             return False
         insort(self._records, record, key=_key)
         if item.phase is Phase.PAIR:
-            # What is measured of a peer opens a contact, which is not done again; it is only to be told from its copies.
+            # A measurement of a peer opens a contact, which is not done again; it is only to be told from its copies.
             record.used, record.waiting = 0, False
             return True
         before_another = self._last is not None and record.key < self._last

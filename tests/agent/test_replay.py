@@ -89,7 +89,7 @@ def rank(event: Event) -> tuple[int, int, str, str, str, bytes]:
 
 
 def story(seed: int) -> list[Event]:
-    """Odometry and measurements over two seconds, in order; measurements between its instants, at them, and together."""
+    """Odometry and measurements over two seconds, in order; these are between its instants, at them, and together."""
     rng = np.random.default_rng(seed)
     events: list[Event] = [odometry(k) for k in range(END_NS // STEP_NS)]
     for _ in range(16):
