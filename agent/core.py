@@ -331,7 +331,7 @@ class Agent:
                 self._process(item, effects)
         else:
             late = item.t_ns < self.filter.t_ns - self.settings.lateness.tolerance_ns
-            with self._quietly(self._log.used(item)):
+            with self._quietly(self._log.used(item, self.filter.t_ns)):
                 self._process(item, effects)
             if late:
                 self._commit()

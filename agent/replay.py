@@ -125,14 +125,14 @@ class ReplayLog:
         known = index < len(self._records) and self._records[index].key == key
         return self._records[index] if known else None
 
-    def used(self, item: Item) -> bool:
-        """The datum is about to be used; whether it was before."""
+    def used(self, item: Item, state_ns: int) -> bool:
+        """The datum is about to be used by a state at `state_ns`; whether it was before."""
         self._uses += 1
         record = self._find(item_key(item))
         if record is None:
             return False
         before, record.used, record.waiting, record.counted = record.counted, self._uses, False, True
-        if record.late and not before:
+        if record.late and not before and item.t_ns >= state_ns - self._tolerance_ns:
             self._counters["late.replayed"] += 1
         self._last = record.key if self._last is None else max(self._last, record.key)
         return before
@@ -248,8 +248,12 @@ class ReplayLog:
         kept_by_filter = bisect_right(self._marks, state_ns - self._horizon_ns, key=_instant) - 1
         index = max(before, kept_by_filter, 0)
         mark = self._marks[index]
+        # Data of before the mark are done again only if there is no mark that is early enough.
+        start = 0
+        if index == before:
+            start = bisect_left(self._records, mark.t_ns - self._tolerance_ns, key=lambda record: record.item.t_ns)
         again, self._last = [], None
-        for record in self._records:
+        for record in self._records[start:]:
             if record.used is not None and record.used <= mark.uses:
                 self._last = record.key if record.used and index > 0 else self._last
             elif not record.waiting:
