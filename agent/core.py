@@ -318,7 +318,7 @@ class Agent:
         if found is not None:
             mark, items, increments = found
             self.filter.rewind(mark.filter)
-            self._odometry.restore(mark.head, mark.gap_ns, increments)
+            self._odometry.restore(mark.gap_ns, increments)
             for item in items:
                 self._timeline.push(item, again=True)
 

@@ -51,12 +51,11 @@ class Record:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mark:
-    """The filter at `t_ns` after so many uses, and the odometry that was under way there."""
+    """The filter at `t_ns` after so many uses, and the gap of the odometry there."""
 
     t_ns: int
     uses: int
     filter: FilterMark
-    head: Odometry | None
     gap_ns: Gap
 
 
@@ -207,7 +206,7 @@ class ReplayLog:
             return
         if self._marks and (self._marks[-1].t_ns, self._marks[-1].uses) == (t_ns, self._uses):
             return
-        self._marks.append(Mark(t_ns, self._uses, found, track.head, track.gap_ns))
+        self._marks.append(Mark(t_ns, self._uses, found, track.gap_ns))
         if len(self._marks) > MAX_MARKS:
             self._counters["replay.horizon_cut"] += 1
             del self._marks[: MAX_MARKS // 16]

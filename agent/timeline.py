@@ -95,21 +95,14 @@ class OdometryTrack:
         return len(self._increments)
 
     @property
-    def head(self) -> Odometry | None:
-        """The first waiting increment, or what is left of it."""
-        return self._increments[0] if self._increments else None
-
-    @property
     def gap_ns(self) -> Gap:
         return self._gap_ns
 
-    def restore(self, head: Odometry | None, gap_ns: Gap, increments: list[Odometry]) -> None:
-        """Go back to where `head` was the first, with all `increments` that end later than the state, in order."""
-        self._increments.clear()
+    def restore(self, gap_ns: Gap, increments: list[Odometry]) -> None:
+        """Go back to a state that all `increments` end later than; they are in order, and what is used of the first is
+        cut off again."""
         self._gap_ns = gap_ns
-        for item in increments[-MAX_INCREMENTS:]:
-            same = head is not None and item.t_meas_ns == head.t_meas_ns
-            self._increments.append(head if same and head is not None else item)
+        self._increments = deque(increments[-MAX_INCREMENTS:])
 
     def put(self, odometry: Odometry) -> None:
         """Take an increment in the order of their ends; it is of what was not used yet."""
