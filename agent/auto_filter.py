@@ -16,11 +16,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.cooperative_filter import CooperativeFilter
+from agent.cooperative_filter import CooperativeFilter, FilterMark
 from agent.effects import Effect, Estimate
 from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.estimation.split_joint import Split
@@ -133,6 +134,16 @@ class AutoFilter:
     def sighting(self, t_ns: int, target: str, event: Observation) -> None:
         self._active.sighting(t_ns, target, event)
         self._check_linearity()
+
+    def mark(self) -> FilterMark | None:
+        kept = self._active.mark()
+        return None if kept is None else FilterMark(self, (self._joint, self._active, self._why, kept))
+
+    def rewind(self, mark: FilterMark) -> None:
+        """A hand-over because of what was measured is taken back with it."""
+        kept = cast("tuple[JointFilter | None, CooperativeFilter, str, FilterMark]", mark.kept)
+        self._joint, self._active, self._why, before = kept
+        self._active.rewind(before)
 
     # -- which form is on -----------------------------------------------------------------------------------
 

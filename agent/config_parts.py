@@ -98,7 +98,7 @@ class LocalizationPart(Part):
 
 
 class LatenessPart(Part):
-    kind: Literal["compensate", "discard"] = "compensate"
+    kind: Literal["compensate", "replay", "discard"] = "compensate"
     settle_s: NotNegative = 0.0
     tolerance_s: NotNegative = 0.001
     horizon_s: Positive = 5.0

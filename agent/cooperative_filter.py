@@ -6,6 +6,7 @@ Instants may lie in the past of the filter's own: late data are used or counted,
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -23,6 +24,14 @@ Array = NDArray[np.float64]
 def refusal(peer: str, epoch: Epoch) -> Send:
     """The answer to a request of a form that is not the own one."""
     return Send(peer, epoch.t_meas_ns, PairReply(epoch, ReplyStatus.OTHER_FORM))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilterMark:
+    """What a filter, the `owner`, needs to return to an instant, if only own data were used since."""
+
+    owner: object
+    kept: object
 
 
 class CooperativeFilter(Protocol):
@@ -94,6 +103,14 @@ class CooperativeFilter(Protocol):
 
     def deadline_ns(self) -> int:
         """When `expire` or `settled` has something to do next."""
+        ...
+
+    def mark(self) -> FilterMark | None:
+        """What is needed to return to the present instant; None: what was used is used for good."""
+        ...
+
+    def rewind(self, mark: FilterMark) -> None:
+        """Return to a mark of the filter. Since then only own data were used, none of them older than the mark."""
         ...
 
     def estimate(self) -> Estimate | None:

@@ -2,13 +2,15 @@
 
 Own data and requests wait in a timeline and are processed in the order of the instants they refer to, once
 those instants have settled and odometry covers them; odometry is cut exactly at each of them. What comes later
-than that is handed over all the same: the filter uses it for the instant it belongs to, or counts it. Nothing from
-outside raises.
+than that is handed over all the same: the filter uses it for the instant it belongs to, or counts it; or it is put in
+its place by a rewind (`agent.replay`). Nothing from outside raises.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +22,7 @@ from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError, absolu
 from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received, Tick
 from agent.forms import build_filter
 from agent.health import Health
+from agent.replay import MAX_LOGGED, ReplayLog
 from agent.saved_state import decode, encode
 from agent.settings import AgentSettings
 from agent.timeline import MAX_INCREMENTS, MAX_WAITING, Item, OdometryTrack, Phase, Timeline
@@ -52,11 +55,19 @@ class Agent:
         self.counters: Counter[str] = Counter()
         self.nis: dict[str, NisSum] = {}
         self.now_ns = settings.start_ns if restored is None else restored.t_ns
-        self._timeline = Timeline()
+        lateness = settings.lateness
+        replayed = lateness.kind == "replay"
+        self._timeline = Timeline(by_content=replayed)
         self._odometry = OdometryTrack(settings.coast, settings.lateness.tolerance_ns, self.counters)
         saved = None if restored is None else restored.saved
         self.health = Health(settings.health, self.counters, None if restored is None else restored.verdicts)
         self.filter: CooperativeFilter = build_filter(settings, self.counters, self._count_nis, self.health, saved)
+        self._log: ReplayLog | None = None
+        if replayed:
+            self._log = ReplayLog(lateness.horizon_ns, lateness.tolerance_ns, self.filter.t_ns, self.counters)
+        self._again_until_ns = self.filter.t_ns
+        self._quiet = False
+        self._commit()
         self._persisted: object = None
         self._persist_due_ns = self.now_ns
         self._published: object = None
@@ -118,8 +129,10 @@ class Agent:
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """What waits or is kept, and the most there may be of it, by name."""
+        log = {} if self._log is None else self._log.sizes()
         return {
-            "timeline": (len(self._timeline), MAX_WAITING),
+            **log,
+            "timeline": (len(self._timeline), MAX_WAITING + (MAX_LOGGED if log else 0)),
             "odometry": (len(self._odometry), MAX_INCREMENTS),
             "figures": (len(self.nis), MAX_KINDS),
         }
@@ -135,6 +148,8 @@ class Agent:
             if begun is not None:
                 self.settings = begun
                 self.filter = build_filter(begun, self.counters, self._count_nis, self.health)
+                self._again_until_ns = self.filter.t_ns
+                self._commit()
 
     def next_deadline_ns(self) -> int:
         """When `handle` wants a `Tick` at the latest, should nothing else happen."""
@@ -148,6 +163,8 @@ class Agent:
         end = self._odometry.next_end_ns(self.filter.t_ns)
         if end is not None:
             deadline = min(deadline, end + lateness.settle_ns)
+        if self._log is not None and self._log.dirty:
+            deadline = min(deadline, self._log.due_ns(self.now_ns))
         return max(deadline, self.now_ns)
 
     def estimate(self) -> Estimate | None:
@@ -185,7 +202,7 @@ class Agent:
             case Tick():
                 pass
             case Odometry():
-                self._odometry.add(event, self.filter.t_ns)
+                self._take_odometry(event)
             case Fix():
                 self._queue(Item(event.t_meas_ns, Phase.PRIVATE, event.sensor, event))
             case Observation():
@@ -193,13 +210,31 @@ class Agent:
             case Received():
                 self._receive(event, effects)
             case LinkChange():
-                self.filter.link_changed(event)
+                with self._told(effects):
+                    self.filter.link_changed(event)
+
+    def _take_odometry(self, event: Odometry) -> None:
+        if self._log is None:
+            self._odometry.add(event, self.filter.t_ns)
+            return
+        since_ns = self._log.odometry(event)
+        if since_ns is None:
+            return
+        if since_ns < self.filter.t_ns - self.settings.lateness.tolerance_ns:
+            self._log.moved_late(event, since_ns)
+        else:
+            self._odometry.put(event)
 
     def _queue(self, item: Item) -> None:
+        log = None if isinstance(item.event, Received) else self._log
         if item.t_ns > self.now_ns + self.settings.lateness.horizon_ns:
             self.counters["input.future"] += 1
-        elif not self._timeline.push(item):
+        elif log is None or log.take(item, self.filter.t_ns):
+            if self._timeline.push(item):
+                return
             self.counters["input.overflow"] += 1
+            if log is not None:
+                log.drop(item)
 
     def _queue_observation(self, event: Observation) -> None:
         if event.kind not in RELATIVE_ANGLES:
@@ -221,11 +256,13 @@ class Agent:
             self._queue(Item(self._asked_ns(event), Phase.PAIR, event.message.header.source, event))
         elif isinstance(body, PairReply | SplitReply):
             self._drain(effects)
-            self.filter.replied(event.message.header.source, body)
+            with self._told(effects):
+                self.filter.replied(event.message.header.source, body)
             self._start()
         else:
             self._drain(effects)
-            self.filter.heard(event, effects)
+            with self._told(effects):
+                self.filter.heard(event, effects)
 
     def _asked_ns(self, event: Received) -> int:
         """The instant that a peer's request refers to, on the own clock."""
@@ -243,13 +280,14 @@ class Agent:
     def _drain(self, effects: list[Effect]) -> None:
         lateness = self.settings.lateness
         settled = self.now_ns - lateness.settle_ns
+        self._rewind()
         while (item := self._timeline.peek()) is not None and item.t_ns <= settled + lateness.tolerance_ns:
             if not self._covered(item.t_ns) and self.now_ns < item.t_ns + lateness.odometry_wait_ns:
                 break
             self._timeline.pop()
             try:
                 self._advance(item.t_ns)
-                self._process(item, effects)
+                self._use(item, effects)
                 self._start()
             except OutOfViewError:
                 self.counters["observation.out_of_view"] += 1
@@ -262,6 +300,8 @@ class Agent:
             ):
                 break
             self._step(end)
+        if self._log is not None:
+            self._advance(self._again_until_ns)
 
     def _advance(self, until_ns: int) -> None:
         while self.filter.t_ns < until_ns - self.settings.lateness.tolerance_ns:
@@ -269,8 +309,73 @@ class Agent:
 
     def _step(self, until_ns: int) -> None:
         """Move the state one stretch of odometry, or of coasting, towards `until_ns` > its instant."""
-        t_ns, delta, cov = self._odometry.step(self.filter.t_ns, until_ns)
-        self.filter.advance(t_ns, delta, cov)
+        before = self.filter.t_ns
+        if self._log is not None:
+            self._log.settle(before)
+            self._log.mark(before, self.filter.mark(), self._odometry)
+        with self._quietly(before < self._again_until_ns):
+            t_ns, delta, cov = self._odometry.step(before, until_ns)
+            self.filter.advance(t_ns, delta, cov)
+        self._again_until_ns = max(self._again_until_ns, t_ns)
+
+    # -- late data ------------------------------------------------------------------------------------------
+
+    def _rewind(self) -> None:
+        """Go back to before late data, if there are any: what follows in the timeline leads here again."""
+        if self._log is None or not self._log.dirty:
+            return
+        # If another form is on by now, what was before it is not done again.
+        self._log.mark(self.filter.t_ns, self.filter.mark(), self._odometry)
+        found = self._log.rewound(self.now_ns, self.filter.t_ns)
+        if found is not None:
+            mark, items, increments = found
+            self.filter.rewind(mark.filter)
+            self._odometry.restore(mark.gap_ns, increments)
+            for item in items:
+                self._timeline.push(item, again=True)
+
+    def _use(self, item: Item, effects: list[Effect]) -> None:
+        """Process an item at its instant; what was used before doesn't count again."""
+        if self._log is None:
+            self._process(item, effects)
+        elif isinstance(item.event, Received) or item.phase is Phase.PAIR:
+            with self._told(effects):
+                self._process(item, effects)
+        else:
+            late = item.t_ns < self.filter.t_ns - self.settings.lateness.tolerance_ns
+            with self._quietly(self._log.used(item, self.filter.t_ns)):
+                self._process(item, effects)
+            if late:
+                self._commit()
+
+    @contextmanager
+    def _told(self, effects: list[Effect]) -> Iterator[None]:
+        """Whatever peers are told or have told can't be taken back."""
+        revision, count = self.filter.revision, len(effects)
+        try:
+            yield
+        finally:
+            if self.filter.revision is not revision or len(effects) > count:
+                self._commit()
+
+    def _commit(self) -> None:
+        """What was used up to now is not to be used again."""
+        if self._log is not None:
+            self._log.commit(self.filter.t_ns, self.filter.mark(), self._odometry)
+
+    @contextmanager
+    def _quietly(self, quiet: bool) -> Iterator[None]:
+        """Leave all figures as they are."""
+        if not quiet:
+            yield
+            return
+        kept, self._quiet = dict(self.counters), True
+        try:
+            yield
+        finally:
+            self._quiet = False
+            self.counters.clear()
+            self.counters.update(kept)
 
     # -- one instant ----------------------------------------------------------------------------------------
 
@@ -333,6 +438,8 @@ class Agent:
         self.filter.measured(peer, t_ns, self.now_ns, tuple(measurements), effects)
 
     def _count_nis(self, kind: str, nis: float) -> None:
+        if self._quiet:
+            return
         entry = self.nis.setdefault(kind, NisSum())
         entry.total += nis
         entry.count += 1

@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.belief import RobotState, TargetState
-from agent.cooperative_filter import refusal
+from agent.cooperative_filter import FilterMark, refusal
 from agent.effects import Effect, Estimate, Send, TrackEstimate
 from agent.estimation.colocalization import Options, Update, sighting_update
 from agent.estimation.observation import AbsoluteModel, RelativeModel, relative_model
@@ -22,7 +23,7 @@ from agent.estimation.track_start import TrackStart
 from agent.events import LinkChange, Observation, Received
 from agent.factor_model import AnySnapshot, FactorModel, SeparateModel
 from agent.health import Health
-from agent.history import History
+from agent.history import History, HistoryMark
 from agent.pairs import Pairs
 from agent.saved_state import SavedFactors
 from agent.settings import AgentSettings
@@ -93,6 +94,21 @@ class FactorFilter:
 
     def saved(self) -> SavedFactors:
         return self._pairs.saved(self.state)
+
+    def mark(self) -> FilterMark:
+        return FilterMark(self, (self.history.mark(), self._aside()))
+
+    def rewind(self, mark: FilterMark) -> None:
+        kept, aside = cast("tuple[HistoryMark, float]", mark.kept)
+        self.state = self.history.rewind(kept)
+        self._put_aside(aside)
+
+    def _aside(self) -> float:
+        """What own data change besides the state."""
+        return 0.0
+
+    def _put_aside(self, aside: float) -> None:
+        """Go back to what `_aside` was."""
 
     # -- own information ------------------------------------------------------------------------------------
 

@@ -42,6 +42,14 @@ class Entry:
     after: Array
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class HistoryMark:
+    """State and left factor of an entry when it was the newest."""
+
+    state: RobotState
+    after: Array
+
+
 class History:
     """Ring of entries over `settings.lateness.horizon_ns`."""
 
@@ -82,6 +90,19 @@ class History:
         entry.state = state
         if left is not None:
             entry.after = left @ entry.after
+
+    def mark(self) -> HistoryMark:
+        """The newest entry as it is."""
+        entry = self._entries[-1]
+        return HistoryMark(entry.state, entry.after)
+
+    def rewind(self, mark: HistoryMark) -> RobotState:
+        """Forget what came after a mark, before whose instant nothing was changed since; returns the newest state."""
+        index = bisect_left(self._stamps, mark.state.t_ns)
+        del self._entries[index + 1 :], self._stamps[index + 1 :]
+        entry = self._entries[index]
+        entry.state, entry.after = mark.state, mark.after
+        return mark.state
 
     def cut(self, t_ns: int) -> RobotState | None:
         """The state at a past instant `t_ns`, as an entry of its own from now on; None outside the ring.

@@ -49,6 +49,12 @@ class JointFilter(FactorFilter):
         """Noticeable second-order residuals of measurements so far, as shares of their variances, one at most each."""
         return self._factors.nonlinearity
 
+    def _aside(self) -> float:
+        return self._factors.nonlinearity
+
+    def _put_aside(self, aside: float) -> None:
+        self._factors.nonlinearity = aside
+
     def _model(self) -> FactorModel:
         self._factors = JointFactors(self._settings, self._counters)
         return self._factors

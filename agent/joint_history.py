@@ -6,7 +6,7 @@ the state. Late information is used at the instant it belongs to, and all that c
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -74,6 +74,19 @@ class JointHistory:
             surplus += 1
         if surplus:
             del self._entries[:surplus], self._stamps[:surplus]
+
+    def mark(self) -> tuple[JointState, int]:
+        """The newest state, and how much was learnt at its instant."""
+        return self.newest, len(self._entries[-1].learnt)
+
+    def rewind(self, mark: tuple[JointState, int]) -> None:
+        """Forget what came after a mark, before whose instant nothing was changed since."""
+        state, count = mark
+        index = bisect_left(self._stamps, state.t_ns)
+        del self._entries[index + 1 :], self._stamps[index + 1 :]
+        entry = self._entries[index]
+        entry.state = state
+        del entry.learnt[count:]
 
     def at(self, t_ns: int) -> JointState | None:
         """The state at `t_ns`, which is an entry's instant from now on; None outside the horizon.

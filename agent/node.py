@@ -144,6 +144,20 @@ def _link_change(now_ns: int, change: PeerChange) -> LinkChange:
     return LinkChange(now_ns, change.peer, change.up, change.incarnation, change.boot_id)
 
 
+REFUSED = (
+    "observation.",
+    "late.dropped",
+    "late.target",
+    "late.too_old",
+    "late.odometry_too_old",
+    "late.odometry_unused",
+    "input.",
+    "odometry.out",
+    "fix.",
+)
+"""How counters of what the core has not used begin."""
+
+
 def rejected(node: Node) -> dict[str, int]:
     """All counters of things refused, by reason, sorted."""
     reasons: Counter[str] = Counter()
@@ -153,6 +167,6 @@ def rejected(node: Node) -> dict[str, int]:
     for name, count in node.counters.items():
         reasons[name] += count
     for name, count in node.agent.counters.items():
-        if name.startswith(("observation.", "late.dropped", "late.target", "input.", "odometry.out", "fix.")):
+        if name.startswith(REFUSED):
             reasons[name] += count
     return dict(sorted(reasons.items()))

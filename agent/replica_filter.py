@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.cooperative_filter import FilterMark
 from agent.effects import Broadcast, Effect, Estimate, TrackEstimate
 from agent.estimation.observation import AbsoluteModel, RelativeModel, levelled, told
 from agent.events import LinkChange, Observation, Received
@@ -68,6 +69,13 @@ class ReplicaFilter:
     @property
     def revision(self) -> object:
         return self._revision
+
+    def mark(self) -> FilterMark | None:
+        """The team has been told: nothing is taken back. What was measured is put in its place by the history."""
+        return None
+
+    def rewind(self, mark: FilterMark) -> None:
+        raise RuntimeError("there is no mark of this filter")
 
     def estimate(self) -> Estimate:
         belief, robot = self._history.belief(), self._settings.robot

@@ -51,6 +51,8 @@ class LocalizationSettings:
 class LatenessSettings:
     """When data are fused and what happens to those that come late.
 
+    kind               late own data: `compensate`, by a delayed update; `replay`, in their place by a bounded rewind as
+                       far back as the last contact; `discard`
     settle_ns          an instant is processed once it is this old, so that all its data are in
     tolerance_ns       stamps this close to a state instant count as that instant
     horizon_ns         how far the history reaches back
@@ -59,7 +61,7 @@ class LatenessSettings:
                        Measured offsets are blended with this prior.
     """
 
-    kind: Literal["compensate", "discard"] = "compensate"
+    kind: Literal["compensate", "replay", "discard"] = "compensate"
     settle_ns: int = 0
     tolerance_ns: int = 1_000_000
     horizon_ns: int = 5 * NS

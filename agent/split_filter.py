@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.cooperative_filter import refusal
+from agent.cooperative_filter import FilterMark, refusal
 from agent.effects import Effect, Estimate, Send, TrackEstimate
 from agent.estimation.motion import STATES
 from agent.estimation.observation import (
@@ -132,6 +133,12 @@ class SplitFilter:
 
     def form(self) -> tuple[str, str]:
         return "split_joint", "configured"
+
+    def mark(self) -> FilterMark:
+        return FilterMark(self, self.history.mark())
+
+    def rewind(self, mark: FilterMark) -> None:
+        self.history.rewind(cast("tuple[JointState, int]", mark.kept))
 
     # -- own information ------------------------------------------------------------------------------------
 

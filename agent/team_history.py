@@ -72,15 +72,15 @@ class Datum:
         return self.item.of if self.item.of is not None and ":" not in self.item.of else None
 
     @property
-    def rank(self) -> tuple[Phase, str, str, int]:
-        """Order among the data of one instant."""
+    def rank(self) -> tuple[Phase, str, str, str, bytes, int]:
+        """Order among the data of one instant, whichever came first."""
         of = self.item.of or ""
         phase = Phase.PAIR
         if self.item.of is None or of.startswith("landmark:"):
             phase = Phase.PRIVATE
         elif of.startswith("target:"):
             phase = Phase.TARGET
-        return phase, self.source, of, self.item.index
+        return phase, self.source, of, self.item.kind, self.item.z.tobytes(), self.item.index
 
 
 @dataclass(slots=True, eq=False)

@@ -41,29 +41,46 @@ class Item:
     event: Fix | Observation | Received
 
 
-class Timeline:
-    """A bounded heap of items ordered by (instant, phase, source, arrival)."""
+ItemKey = tuple[int, Phase, str, str, str, bytes, bytes]
+"""Order of items, and what tells two of them apart, whenever they arrive."""
 
-    def __init__(self) -> None:
-        self._heap: list[tuple[int, Phase, str, int, Item]] = []
+Gap = tuple[int, int] | None
+"""Where a gap of the odometry began, and how far it was coasted over."""
+
+
+def item_key(item: Item) -> ItemKey:
+    """(instant, phase, source, sensor, kind, z, R) of an own datum; what a message tells is not looked at."""
+    event = item.event
+    if isinstance(event, Received):
+        return item.t_ns, item.phase, item.source, "", "", b"", b""
+    return item.t_ns, item.phase, item.source, event.sensor, event.kind, event.z.tobytes(), event.R.tobytes()
+
+
+class Timeline:
+    """A bounded heap of items ordered by (instant, phase, source, then what they are or when they arrived)."""
+
+    def __init__(self, by_content: bool = False) -> None:
+        self._by_content = by_content
+        self._heap: list[tuple[ItemKey, int, Item]] = []
         self._arrivals = 0
 
     def __len__(self) -> int:
         return len(self._heap)
 
-    def push(self, item: Item) -> bool:
-        """Add an item; False when the heap is full."""
-        if len(self._heap) >= MAX_WAITING:
+    def push(self, item: Item, again: bool = False) -> bool:
+        """Add an item; False when the heap is full, unless it is one that was in it before and comes `again`."""
+        if len(self._heap) >= MAX_WAITING and not again:
             return False
         self._arrivals += 1
-        heapq.heappush(self._heap, (item.t_ns, item.phase, item.source, self._arrivals, item))
+        key = item_key(item) if self._by_content else (item.t_ns, item.phase, item.source, "", "", b"", b"")
+        heapq.heappush(self._heap, (key, self._arrivals, item))
         return True
 
     def peek(self) -> Item | None:
-        return self._heap[0][4] if self._heap else None
+        return self._heap[0][2] if self._heap else None
 
     def pop(self) -> Item:
-        return heapq.heappop(self._heap)[4]
+        return heapq.heappop(self._heap)[2]
 
 
 class OdometryTrack:
@@ -72,10 +89,31 @@ class OdometryTrack:
     def __init__(self, coast: CoastSettings, tolerance_ns: int, counters: Counter[str]) -> None:
         self._coast, self._tolerance_ns, self._counters = coast, tolerance_ns, counters
         self._increments: deque[Odometry] = deque()
-        self._gap_ns: tuple[int, int] | None = None
+        self._gap_ns: Gap = None
 
     def __len__(self) -> int:
         return len(self._increments)
+
+    @property
+    def gap_ns(self) -> Gap:
+        return self._gap_ns
+
+    def restore(self, gap_ns: Gap, increments: list[Odometry]) -> None:
+        """Go back to a state that all `increments` end later than; they are in order, and what is used of the first is
+        cut off again."""
+        self._gap_ns = gap_ns
+        self._increments = deque(increments[-MAX_INCREMENTS:])
+
+    def put(self, odometry: Odometry) -> None:
+        """Take an increment in the order of their ends; it is of what was not used yet."""
+        if len(self._increments) >= MAX_INCREMENTS:
+            self._counters["odometry.overflow"] += 1
+            self._increments.popleft()
+        later = []
+        while self._increments and self._increments[-1].t_meas_ns > odometry.t_meas_ns:
+            later.append(self._increments.pop())
+        self._increments.append(odometry)
+        self._increments.extend(reversed(later))
 
     def copy(self) -> OdometryTrack:
         """A track of its own with the same increments."""

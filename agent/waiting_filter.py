@@ -7,6 +7,7 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.cooperative_filter import FilterMark
 from agent.effects import Effect, Estimate, Send
 from agent.estimation.motion import STATES
 from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, RelativeModel
@@ -161,6 +162,13 @@ class WaitingFilter:
         return FAR_FUTURE_NS
 
     # -- for people -----------------------------------------------------------------------------------------
+
+    def mark(self) -> FilterMark | None:
+        """There is no estimate that could be made again."""
+        return None
+
+    def rewind(self, mark: FilterMark) -> None:
+        raise RuntimeError("there is no mark of this filter")
 
     def estimate(self) -> Estimate | None:
         return None
