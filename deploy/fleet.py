@@ -173,24 +173,32 @@ class Fleet(ABC):
 
     def anees(self, robot: str, since_s: float = 0.0, until_s: float = np.inf) -> float:
         """Mean NEES per degree of freedom of a robot over a span; NaN if it had no estimate."""
-        t_s, found = self.traces()
-        during = (t_s >= since_s) & (t_s <= until_s)
-        ratio = nees(found[robot])[during]
-        ratio = ratio[np.isfinite(ratio)]
-        return float(ratio.mean()) if len(ratio) else float("nan")
+        return mean_nees(self.traces(), robot, since_s, until_s)
 
     def assert_consistent(self, limit: float = LIMIT, since_s: float = 0.0) -> None:
         """No robot claims to know more than it does: its mean NEES per degree of freedom is at most `limit`.
 
         Nothing is known of a robot that had no estimate all the time, which fails too.
         """
+        traces = self.traces()
         for robot in self.robots:
-            anees = self.anees(robot, since_s)
+            anees = mean_nees(traces, robot, since_s)
             assert np.isfinite(anees), f"{robot} had no estimate between {since_s:g} and {self.t_s:g} s"
             assert anees <= limit, (
                 f"{robot} is overconfident: ANEES {anees:.2f} is above {limit:g} after {self.t_s:g} s; replay it with "
                 f"seed {self.seed} of scenario '{self.scenario.name}'"
             )
+
+
+def mean_nees(
+    traces: tuple[Array, dict[str, StateTrace]], robot: str, since_s: float = 0.0, until_s: float = np.inf
+) -> float:
+    """Mean NEES per degree of freedom of a robot over a span; NaN if it had no estimate."""
+    t_s, found = traces
+    during = (t_s >= since_s) & (t_s <= until_s)
+    ratio = nees(found[robot])[during]
+    ratio = ratio[np.isfinite(ratio)]
+    return float(ratio.mean()) if len(ratio) else float("nan")
 
 
 def until(trace: TrialTrace, t_s: float) -> tuple[Array, dict[str, StateTrace]]:

@@ -9,15 +9,18 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from agent.config_file import ConfigError
-from agent.fault_parts import AnyFaultPart, CrashPart
+from agent.fault_parts import AnyFaultPart, CrashPart, RestartPart
 from deploy.evaluate import trace_of
+from deploy.exit_words import ended
 from deploy.fault import ask, socket_of
 from deploy.fleet import Array, Fleet, until
-from deploy.launch import TOLD_S, Launcher, LaunchError, Member, ended
+from deploy.launch import TOLD_S, Launcher, LaunchError
+from deploy.member import Member
 from deploy.runs import write_scenario
 from sim.agents import table
 from sim.metrics import StateTrace
@@ -27,6 +30,8 @@ from sim.trial import open_world
 PAUSE_S = 0.05
 SETTLE_S = 0.3
 """Wall time within which an agent has used what belongs to an instant."""
+STARTED_S = 30.0
+"""Wall time after which a process that does not end or start is no longer waited for."""
 HEARD_S = 3.0
 """Wall time after which a robot that says nothing is no longer waited for."""
 
@@ -34,8 +39,8 @@ HEARD_S = 3.0
 class ProcessFleet(Fleet):
     """In real processes, `speed` times as fast as real time. Time goes on by itself, also between two calls.
 
-    Injecting or ending a fault takes a moment: when the call returns, all processes act on it. Status and traces are
-    those of the time of the call, and waited for.
+    Injecting or ending a fault takes a moment: when the call returns, all processes act on it, who is killed is gone,
+    and who is restarted is at work again. Status and traces are those of the time of the call, and waited for.
     """
 
     def __init__(self, scenario: Scenario, seed: int, speed: float, run_dir: Path) -> None:
@@ -120,11 +125,12 @@ class ProcessFleet(Fleet):
     def _heard(self, robots: tuple[str, ...]) -> None:
         """Wait until those of the robots that are up have told what they know of this instant."""
         now = time.monotonic()
-        while time.monotonic() < now + HEARD_S and self._thread.is_alive():
+
+        def told() -> bool:
             up = [member for robot in robots if (member := self._member(robot)) is not None and member.status]
-            if all(member.heard_s > now + SETTLE_S for member in up):
-                return
-            time.sleep(PAUSE_S)
+            return all(member.heard_s > now + SETTLE_S for member in up)
+
+        self._wait(told, HEARD_S)
 
     def traces(self) -> tuple[Array, dict[str, StateTrace]]:
         t_s = self.t_s
@@ -149,17 +155,30 @@ class ProcessFleet(Fleet):
             time.sleep(TOLD_S + PAUSE_S)
         return answer
 
+    def _told_since(self, robot: str, before: Member) -> bool:
+        """Whether a life after `before` is at work."""
+        member = self._launcher.members[robot]
+        return member is not before and "t_ns" in member.status
+
     def _inject(self, name: str, fault: AnyFaultPart) -> None:
+        before = {robot: self._launcher.members[robot] for robot in self.robots}
         # From the earliest instant on by which all processes know of it.
         keys = {key: value for key, value in table(fault).items() if key != "at_s"}
         answer = self._ask({"inject": {**keys, "id": name}})
         if "error" in answer:
             raise ConfigError(answer["error"])
         self._faults[name] = fault
-        if isinstance(fault, CrashPart):
-            deadline = time.monotonic() + HEARD_S
-            while self._member(fault.robot) is not None and fault.for_s is None and time.monotonic() < deadline:
-                time.sleep(PAUSE_S)
+        match fault:
+            case CrashPart(for_s=None):
+                self._wait(lambda: self._member(fault.robot) is None, STARTED_S)
+            case RestartPart(for_s=None):
+                self._wait(lambda: self._told_since(fault.robot, before[fault.robot]), STARTED_S)
+
+    def _wait(self, until: Callable[[], bool], seconds: float) -> None:
+        """Wait until something is so, for so much wall time at most, while the run goes on."""
+        end = time.monotonic() + seconds
+        while not until() and time.monotonic() < end and self._thread.is_alive():
+            time.sleep(PAUSE_S)
 
     def end(self, name: str) -> bool:
         fault = self._faults.get(name)

@@ -28,6 +28,30 @@ def test_a_partition_is_survived_and_forgotten(fleet: FleetMaker) -> None:
     robots.assert_consistent()
 
 
+@pytest.mark.parametrize("runtime", ["virtual", "processes"])
+def test_one_story_in_virtual_time_and_in_real_processes(fleet: FleetMaker, runtime: str) -> None:
+    """`speed` makes the example short; without it real processes take the time the world does."""
+    speed = 2.5 if runtime == "processes" else 1.0
+    robots = fleet(OWN, QUIET, "fault_plan.processes=false", "duration_s=90.0", runtime=runtime, speed=speed, seed=4)
+    robots.run_until(4.0)
+    cut = robots.partition(["r1", "r2"], ["r3", "r4", "r5"])
+    robots.link("r3", "r4").loss = 0.5
+    robots.kill("r5")
+    robots.run_for(1.0)
+    since_ns = robots.status("r3")["pairs"]["r1"]
+    assert robots.status("r5") == {} and robots.status("r1")["state"] == "running"
+    robots.run_until(9.0)
+    assert math.isnan(robots.error_m("r5")) and robots.error_m("r3") < 5.0
+    assert robots.status("r3")["pairs"]["r1"] == since_ns
+    robots.heal()
+    robots.restart("r5")
+    robots.run_for(6.0)
+    assert not robots.end(cut)
+    assert robots.status("r3")["pairs"]["r1"] > since_ns + 1_000_000_000
+    assert robots.status("r5")["state"] == "running" and robots.error_m("r5") < 5.0
+    robots.assert_consistent()
+
+
 def test_a_killed_robot_is_gone_and_comes_back(fleet: FleetMaker) -> None:
     robots = fleet(OWN, QUIET, seed=3)
     robots.run_for(6.0)
