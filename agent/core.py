@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from agent.cooperative_filter import CooperativeFilter
 from agent.effects import Alarm, Effect, Estimate, Persist, Publish, Send, TrackEstimate
 from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError, absolute_model, relative_model, told
-from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received, Tick
+from agent.events import ClockJudged, Event, Fix, LinkChange, Observation, Odometry, Received, Tick
 from agent.forms import build_filter
 from agent.saved_state import decode, encode
 from agent.settings import AgentSettings
@@ -60,6 +60,8 @@ class Agent:
         self._published: object = None
         self._tracks: tuple[str, ...] = ()
         self._missing: tuple[str, ...] = ()
+        self._clocks_off: set[str] = set()
+        """Peers whose clocks are of no use; the endpoint keeps only so many peers."""
 
     # -- events ---------------------------------------------------------------------------------------------
 
@@ -188,6 +190,11 @@ class Agent:
                 self._receive(event, effects)
             case LinkChange():
                 self.filter.link_changed(event)
+            case ClockJudged(_, peer, reason):
+                if reason is None:
+                    self._clocks_off.discard(peer)
+                else:
+                    self._clocks_off.add(peer)
 
     def _queue(self, item: Item) -> None:
         if item.t_ns > self.now_ns + self.settings.lateness.horizon_ns:
@@ -317,6 +324,10 @@ class Agent:
             else:
                 measurements.append(told(found))
         if not measurements:
+            return
+        if peer in self._clocks_off and self.settings.localization.kind != "replica":
+            # Its answer would be of no known instant. Where raw data are told there is nothing to answer.
+            self.counters["observation.clock_unusable"] += len(measurements)
             return
         self.filter.measured(peer, t_ns, self.now_ns, tuple(measurements), effects)
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from agent.core import Agent
 from agent.effects import Alarm, Broadcast, Effect, Estimate, Persist, Publish, Send
-from agent.events import Event, LinkChange, Received, Tick
+from agent.events import ClockJudged, Event, LinkChange, Received, Tick
 from agent.sensor_input import SensorConfig, SensorError, decode
 from agent.settings import AgentSettings
 from network.endpoint import ClockChange, Delivery, Endpoint, EndpointSettings, PeerChange
@@ -80,6 +80,7 @@ class Node:
         for item in self.endpoint.receive(now_ns, packet):
             if isinstance(item, ClockChange):
                 out.alarms.append(_clock_alarm(item))
+                self._handle(ClockJudged(now_ns, item.peer, item.reason), out)
             elif isinstance(item, Delivery):
                 self._handle(Received(now_ns, item.message, item.offset_ns, item.offset_sigma_ns), out)
             else:

@@ -189,7 +189,12 @@ def _cells(exit_code: int | None, status: dict[str, Any]) -> list[str]:
         return ["waiting" if status.get("missing") else "starting", "; ".join(status.get("missing", [])), *blank[1:]]
     counters = status.get("counters", {})
     contacts = counters.get("pair.applied_initiator", 0) + counters.get("pair.applied_responder", 0)
-    peers = " ".join(peer for peer, up in sorted(status.get("peers", {}).items()) if up)
+    off = {peer: clock["unusable"] for peer, clock in status.get("clocks", {}).items() if clock["unusable"]}
+    peers = " ".join(
+        f"{peer} (clock: {off[peer]})" if peer in off else peer
+        for peer, up in sorted(status.get("peers", {}).items())
+        if up
+    )
     return [
         "running",
         peers or "none heard",
