@@ -95,7 +95,7 @@ class PeerChange:
 
 @dataclass(frozen=True, slots=True)
 class ClockChange:
-    """A peer's clock is unusable from now on for a `reason` of `PeerClock.unusable`, or usable as far as is known (None)."""
+    """A peer's clock is unusable for a `reason` of `PeerClock.unusable`, or usable again or not judged yet (None)."""
 
     peer: str
     reason: str | None
