@@ -8,6 +8,7 @@ import pytest
 
 from agent.config_file import ConfigError
 from deploy.testing import FleetMaker, fleet
+from sim.invariants import InvariantBreach
 
 __all__ = ["fleet"]
 
@@ -28,7 +29,7 @@ def test_a_partition_is_survived_and_forgotten(fleet: FleetMaker) -> None:
     robots.assert_consistent()
 
 
-@pytest.mark.parametrize("runtime", ["virtual", "processes"])
+@pytest.mark.parametrize("runtime", ["virtual", pytest.param("processes", marks=pytest.mark.realtime)])
 def test_one_story_in_virtual_time_and_in_real_processes(fleet: FleetMaker, runtime: str) -> None:
     """`speed` makes the example short; without it real processes take the time the world does."""
     speed = 2.5 if runtime == "processes" else 1.0
@@ -90,6 +91,14 @@ def test_pauses_sensor_faults_and_isolation_leave_the_fleet_honest(fleet: FleetM
     robots.assert_consistent()
 
 
+def test_invariants_may_be_watched(fleet: FleetMaker, monkeypatch: pytest.MonkeyPatch) -> None:
+    robots = fleet(OWN, check=True)
+    robots.run_for(2.0)
+    monkeypatch.setattr("sim.invariants.MAX_COUNTERS", 0)
+    with pytest.raises(InvariantBreach, match="counters"):
+        robots.run_for(2.0)
+
+
 def test_two_fleets_of_one_seed_are_the_same(fleet: FleetMaker) -> None:
     one, two = fleet(OWN, seed=9), fleet(OWN, seed=9)
     for robots in (one, two):
@@ -109,6 +118,14 @@ def test_what_makes_no_sense_is_refused_with_the_remedy(fleet: FleetMaker) -> No
         robots.inject("loss", share=2.0)
     with pytest.raises(ConfigError, match="kind"):
         robots.inject("earthquake")
+    with pytest.raises(ConfigError, match="r1 has no sensor 'sonar'"):
+        robots.inject("sensor_dropout", robot="r1", sensor="sonar")
+    with pytest.raises(ConfigError, match="virtual, processes"):
+        fleet(OWN, runtime="field")
+    with pytest.raises(ConfigError, match="speed is for runtime='processes'"):
+        fleet(OWN, speed=2.0)
+    with pytest.raises(ConfigError, match="check is for runtime='virtual'"):
+        fleet(OWN, runtime="processes", check=True)
 
 
 def test_an_overconfident_robot_is_found(fleet: FleetMaker) -> None:
