@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -72,6 +73,20 @@ def test_an_agent_that_dies_by_itself_fails_the_test(fleet: FleetMaker) -> None:
     os.kill(member.process.pid, signal.SIGKILL)
     with pytest.raises(LaunchError, match="r4 was ended by SIGKILL"):
         robots.run_for(10.0)
+
+
+def test_who_is_killed_stays_away_until_it_is_restarted(fleet: FleetMaker) -> None:
+    robots = fleet(*CALM, "duration_s=90.0", runtime="processes", speed=2.0, seed=3)
+    robots.run_until(3.0)
+    robots.kill("r5")
+    assert robots.status("r5") == {}
+    robots.run_for(2.0)
+    assert math.isnan(robots.error_m("r5"))
+    robots.restart("r5")
+    assert robots.status("r5")["state"] == "running"
+    robots.run_for(5.0)
+    assert robots.error_m("r5") < 5.0
+    robots.assert_consistent()
 
 
 def test_it_plays_to_the_end_and_tells_what_it_played(fleet: FleetMaker) -> None:

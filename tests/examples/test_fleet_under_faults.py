@@ -42,14 +42,12 @@ def test_one_story_in_virtual_time_and_in_real_processes(fleet: FleetMaker, runt
     since_ns = robots.status("r3")["pairs"]["r1"]
     assert robots.status("r5") == {} and robots.status("r1")["state"] == "running"
     robots.run_until(9.0)
-    assert math.isnan(robots.error_m("r5")) and robots.error_m("r3") < 5.0
     assert robots.status("r3")["pairs"]["r1"] == since_ns
     robots.heal()
-    robots.restart("r5")
-    robots.run_for(6.0)
     assert not robots.end(cut)
+    robots.run_for(6.0)
     assert robots.status("r3")["pairs"]["r1"] > since_ns + 1_000_000_000
-    assert robots.status("r5")["state"] == "running" and robots.error_m("r5") < 5.0
+    assert math.isnan(robots.error_m("r5")) and robots.error_m("r3") < 5.0
     robots.assert_consistent()
 
 
