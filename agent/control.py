@@ -7,15 +7,20 @@
 `changes` are the messages about faults so far, for a process that starts while the run goes on; times of faults count
 from the start of the run.
 
-The end of the stream counts as a stop: no process outlives its launcher.
+The end of the stream counts as a stop: no process outlives its launcher, not even one that is paused.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes
 import json
+import signal
 from typing import Any
+
+PR_SET_PDEATHSIG = 1
+"""Of prctl(2)."""
 
 
 class ControlLine:
@@ -32,6 +37,8 @@ class ControlLine:
 
     async def connect(self, path: str) -> None:
         """Connect and say hello. Raises OSError when nobody listens."""
+        # A paused process goes on when its launcher dies, and finds the end of the stream.
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGCONT, 0, 0, 0)
         reader, self._writer = await asyncio.open_unix_connection(path)
         self.started = asyncio.get_running_loop().create_future()
         self._task = asyncio.create_task(self._read(reader))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from agent.cooperative_filter import CooperativeFilter
 from agent.effects import Alarm, Effect, Estimate, Persist, Publish, Send, TrackEstimate
 from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError, absolute_model, relative_model, told
-from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received, Tick
+from agent.events import ClockJudged, Event, Fix, LinkChange, Observation, Odometry, Received, Tick
 from agent.forms import build_filter
 from agent.health import Health
 from agent.replay import MAX_LOGGED, ReplayLog
@@ -73,6 +73,8 @@ class Agent:
         self._published: object = None
         self._tracks: tuple[str, ...] = ()
         self._missing: tuple[str, ...] = ()
+        self._clocks_off: set[str] = set()
+        """Peers whose clocks are of no use; the endpoint keeps only so many peers."""
 
     # -- events ---------------------------------------------------------------------------------------------
 
@@ -212,6 +214,11 @@ class Agent:
             case LinkChange():
                 with self._told(effects):
                     self.filter.link_changed(event)
+            case ClockJudged(_, peer, reason):
+                if reason is None:
+                    self._clocks_off.discard(peer)
+                else:
+                    self._clocks_off.add(peer)
 
     def _take_odometry(self, event: Odometry) -> None:
         if self._log is None:
@@ -434,6 +441,10 @@ class Agent:
             else:
                 measurements.append(told(found))
         if not measurements:
+            return
+        if peer in self._clocks_off and self.settings.localization.kind != "replica":
+            # Its answer would be of no known instant. Where raw data are told there is nothing to answer.
+            self.counters["observation.clock_unusable"] += len(measurements)
             return
         self.filter.measured(peer, t_ns, self.now_ns, tuple(measurements), effects)
 

@@ -94,4 +94,13 @@ class LinkChange:
     boot_id: int
 
 
-Event = Tick | Odometry | Fix | Observation | Received | LinkChange
+@dataclass(frozen=True, slots=True)
+class ClockJudged:
+    """A peer's clock has become unusable for a `reason`, or usable again (None)."""
+
+    t_ns: int
+    peer: str
+    reason: str | None
+
+
+Event = Tick | Odometry | Fix | Observation | Received | LinkChange | ClockJudged

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 from agent.core import Agent
 from agent.effects import Alarm, Broadcast, Effect, Estimate, Persist, Publish, Send
-from agent.events import Event, LinkChange, Received, Tick
+from agent.events import ClockJudged, Event, LinkChange, Received, Tick
 from agent.sensor_input import SensorConfig, SensorError, decode
 from agent.settings import AgentSettings
 from network.endpoint import ClockChange, Delivery, Endpoint, EndpointSettings, PeerChange
@@ -79,6 +80,7 @@ class Node:
         for item in self.endpoint.receive(now_ns, packet):
             if isinstance(item, ClockChange):
                 out.alarms.append(_clock_alarm(item))
+                self._handle(ClockJudged(now_ns, item.peer, item.reason), out)
             elif isinstance(item, Delivery):
                 self._handle(Received(now_ns, item.message, item.offset_ns, item.offset_sigma_ns), out)
             else:
@@ -98,6 +100,27 @@ class Node:
 
     def next_deadline_ns(self) -> int:
         return min(self.endpoint.next_deadline_ns(), self.agent.next_deadline_ns())
+
+    def status(self) -> dict[str, Any]:
+        """What a person wants to know, as plain values."""
+        peers = self.endpoint.peers()
+        clocks = {
+            peer.peer: {
+                "offset_s": peer.offset_ns * 1e-9,
+                "sigma_s": peer.offset_sigma_ns * 1e-9,
+                "steps": peer.clock_steps,
+                "unusable": peer.clock_unusable,
+            }
+            for peer in peers
+            if peer.offset_ns is not None and peer.offset_sigma_ns is not None
+        }
+        return {
+            "robot": self.robot,
+            **self.agent.status(),
+            "peers": {peer.peer: peer.up for peer in peers},
+            "clocks": clocks,
+            "rejected": rejected(self),
+        }
 
     def _handle(self, event: Event, out: Outgoing) -> None:
         effects = self.agent.handle(event)

@@ -125,6 +125,10 @@ class RecordingWriter:
         stamp = max(t_ns, 0)
         self._writer.add_message(self._channels[topic], stamp, data, stamp, self._sequence)
 
+    def flush(self) -> None:
+        """Hand what was recorded to the operating system: it stays if this process is killed."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
     def close(self) -> None:
         """Finish the file; a file that was not closed is refused by readers."""
         self._writer.finish()  # type: ignore[no-untyped-call]

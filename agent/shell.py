@@ -270,6 +270,9 @@ class AgentShell:
         while not any(wait.done() for wait in waits):
             await asyncio.wait(waits, timeout=STATUS_INTERVAL_S, return_when=asyncio.FIRST_COMPLETED)
             status = self.status()
+            # Before the status is told: who has heard it can read all that led to it.
+            if self._recording is not None:
+                self._recording.flush()
             if self._control is not None:
                 self._control.say({"status": status})
             if self._transport is not None:
@@ -341,15 +344,7 @@ class AgentShell:
         """What a person wants to know, as plain values."""
         if self._node is None:
             return {"robot": self.robot, "state": "waiting for the start"}
-        agent = self._node.agent
-        status: dict[str, Any] = {"robot": self.robot, **agent.status()}
-        status["peers"] = {peer.peer: peer.up for peer in self._node.endpoint.peers()}
-        status["clocks"] = {
-            peer.peer: {"offset_s": peer.offset_ns * 1e-9, "steps": peer.clock_steps, "unusable": peer.clock_unusable}
-            for peer in self._node.endpoint.peers()
-            if peer.offset_ns is not None
-        }
-        status["rejected"] = rejected(self._node)
+        status = self._node.status()
         status["state_file"] = dict(self.counters)
         status["lag_max_s"] = self._lags.max_ns * 1e-9
         injection = self.config.injection

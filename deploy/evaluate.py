@@ -24,6 +24,7 @@ from sim.bound import BoundRunner
 from sim.engine import TrialResult, network_figures
 from sim.fault_plan import trial_faults
 from sim.faulty_world import FaultyWorld
+from sim.metrics import TrialTrace
 from sim.sampling import MeasurementLog, Sampler, sample_stride
 from sim.scenario import Scenario
 from sim.world import World
@@ -37,20 +38,16 @@ def collect(
     scenario: Scenario, world: World, run_dir: Path, outcome: Outcome, with_bound: bool, seed: int = 1
 ) -> TrialResult:
     """A `TrialResult` as the virtual engine gives it, from recordings and what the agents said at their end."""
-    clocks = _clocks(scenario, seed, outcome.t0_ns)
     sensed = FaultyWorld(world, seed, {robot.id: autopilot_fix(robot) for robot in scenario.robots})
     for name, fault in trial_faults(scenario, seed).items():
         if isinstance(fault, DropoutPart | OutliersPart | BiasPart | SilencePart):
             sensed.add(name, fault)
-    sampler = Sampler(scenario, world, with_bound)
-    contacts: list[tuple[float, str, str]] = []
+    sampler, contacts = _sampled(scenario, world, run_dir, outcome.t0_ns, seed, with_bound)
     counters: dict[str, dict[str, int]] = {}
     nis: dict[str, dict[str, tuple[float, int]]] = {}
     rejected: Counter[str] = Counter()
     traffic: Counter[str] = Counter()
     for robot in world.robots:
-        paths = life_files(run_dir, robot, "mcap")
-        _sample(sampler, world, robot, paths, clocks.get(robot, FaultyClock()), outcome.t0_ns, contacts)
         figures: dict[str, Any] = outcome.figures.get(robot, {})
         counters[robot] = figures.get("counters", {})
         nis[robot] = {kind: (total, count) for kind, (total, count) in figures.get("nis", {}).items()}
@@ -72,7 +69,6 @@ def collect(
             if row_index is not None:
                 for entity in (*world.robots, *world.targets):
                     sampler.put_bound(entity, row_index, runner.belief(entity))
-    contacts.sort()
     return TrialResult(
         sampler.trace(),
         contacts,
@@ -82,6 +78,24 @@ def collect(
         counters,
         measured=measured.instants(),
     )
+
+
+def trace_of(scenario: Scenario, world: World, run_dir: Path, t0_ns: int, seed: int) -> TrialTrace:
+    """Truth and estimates at sampled instants, as far as recordings tell; the run may go on."""
+    return _sampled(scenario, world, run_dir, t0_ns, seed, with_bound=False)[0].trace()
+
+
+def _sampled(
+    scenario: Scenario, world: World, run_dir: Path, t0_ns: int, seed: int, with_bound: bool
+) -> tuple[Sampler, list[tuple[float, str, str]]]:
+    """Estimates at sampled instants, and the contacts in order."""
+    clocks = _clocks(scenario, seed, t0_ns)
+    sampler = Sampler(scenario, world, with_bound)
+    contacts: list[tuple[float, str, str]] = []
+    for robot in world.robots:
+        paths = life_files(run_dir, robot, "mcap")
+        _sample(sampler, world, robot, paths, clocks.get(robot, FaultyClock()), t0_ns, contacts)
+    return sampler, sorted(contacts)
 
 
 def _clocks(scenario: Scenario, seed: int, t0_ns: int) -> dict[str, FaultyClock]:

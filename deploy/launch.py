@@ -13,6 +13,7 @@ import json
 import shutil
 import signal
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -81,8 +82,10 @@ class Launcher:
         # Sockets live in a short private path: their length is limited.
         private = self._nemesis.private = Path(tempfile.mkdtemp(prefix="cofix-"))
         loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, self._interrupt)
+        # Signals are the main thread's; beside it whoever started this thread calls `interrupt`.
+        watched = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+        for number in watched:
+            loop.add_signal_handler(number, self.interrupt)
         server = None
         try:
             plan = self._write_files(private)
@@ -97,7 +100,7 @@ class Launcher:
             await self._end()
             if server is not None:
                 server.close()
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in watched:
                 loop.remove_signal_handler(number)
             shutil.rmtree(private, ignore_errors=True)
         return self._outcome()
@@ -113,6 +116,11 @@ class Launcher:
             return 0.0
         wall_ns = time.monotonic_ns() - self._begin["monotonic0_ns"] + int(ahead_s * NS)
         return max(wall_ns / NS * self._speed, 0.0)
+
+    @property
+    def t0_ns(self) -> int:
+        """The start of the run in fleet time, 0 before it is known."""
+        return self._t0_ns
 
     def injected(self) -> list[str]:
         """Names of the faults that are on now."""
@@ -242,7 +250,8 @@ class Launcher:
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self._changed.wait(), seconds)
 
-    def _interrupt(self) -> None:
+    def interrupt(self) -> None:
+        """End the run; to be called in its event loop."""
         self._interrupted = True
         self._changed.set()
 

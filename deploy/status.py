@@ -195,9 +195,11 @@ def _cells(exit_code: int | None, status: dict[str, Any]) -> list[str]:
     counters = status.get("counters", {})
     contacts = counters.get("pair.applied_initiator", 0) + counters.get("pair.applied_responder", 0)
     judged = status.get("health", {}).get("peers", {})
-    quarantined = {peer for peer, found in judged.items() if found["verdict"] == "quarantined"}
+    unused = {peer: "quarantined" for peer, found in judged.items() if found["verdict"] == "quarantined"}
+    clocks = status.get("clocks", {})
+    unused |= {peer: f"clock: {clock['unusable']}" for peer, clock in clocks.items() if clock["unusable"]}
     peers = " ".join(
-        f"[red]{peer} (quarantined)[/red]" if peer in quarantined else peer
+        f"[red]{peer} ({unused[peer]})[/red]" if peer in unused else peer
         for peer, up in sorted(status.get("peers", {}).items())
         if up
     )

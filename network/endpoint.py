@@ -107,7 +107,7 @@ class PeerChange:
 
 @dataclass(frozen=True, slots=True)
 class ClockChange:
-    """A peer's clock has become unusable for a `reason` of `PeerClock.unusable`, or usable again (None)."""
+    """A peer's clock is unusable for a `reason` of `PeerClock.unusable`, or usable again or not judged yet (None)."""
 
     peer: str
     reason: str | None
@@ -258,9 +258,16 @@ class Endpoint:
             peer = self._table.admit(now_ns, header.source, header.boot_id, header.incarnation)
             if peer is None:
                 raise WireError("too_many_peers")
+            if (gone := self._table.forgotten) is not None and gone.clock_unusable is not None:
+                self._clock_changes.append(ClockChange(gone.robot, None))
+        unusable = peer.clock_unusable
         events: list[Delivery | PeerChange] = []
         if peer.accept(now_ns, header.t_send_ns, header.boot_id, header.incarnation, packet.channel, header.seq):
             events.append(_change(peer))
+            if unusable is not None and peer.clock_unusable is None:
+                # A new life has a clock that nobody has judged yet.
+                self.counters["clock_usable"] += 1
+                self._clock_changes.append(ClockChange(peer.robot, None))
         if isinstance(body, Hello):
             self.counters["hellos"] += 1
             if fresh is not None:

@@ -113,17 +113,20 @@ class PeerTable:
         self.silent_after_ns = silent_after_ns
         self.forget_after_ns = forget_after_ns
         self._peers: dict[str, Peer] = {}
+        self.forgotten: Peer | None = None
+        """Who had to go for the peer that was admitted last, if anybody."""
 
     def get(self, robot: str) -> Peer | None:
         return self._peers.get(robot)
 
     def admit(self, now_ns: int, robot: str, boot_id: int, incarnation: int) -> Peer | None:
         """A new entry for a robot not in the table, or None if there is no room."""
+        self.forgotten = None
         if len(self._peers) >= MAX_PEERS:
             oldest = min(self._peers.values(), key=lambda peer: (peer.heard_ns, peer.robot))
             if oldest.up or now_ns - oldest.heard_ns < self.forget_after_ns:
                 return None
-            del self._peers[oldest.robot]
+            self.forgotten = self._peers.pop(oldest.robot)
         peer = Peer(robot, boot_id, incarnation)
         self._peers[robot] = peer
         return peer

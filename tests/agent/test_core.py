@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from agent.core import Agent
 from agent.effects import Send
 from agent.estimation.motion import LAYOUTS, SpatialMotion, TargetMotion, split_increment
-from agent.events import Event, Fix, Observation, Odometry, Tick
+from agent.events import ClockJudged, Event, Fix, Observation, Odometry, Tick
 from agent.recording import pack
 from agent.settings import NS, AgentSettings, LatenessSettings, LocalizationSettings, TargetSettings
 from network.messages import PairRequest
@@ -195,6 +195,24 @@ def test_the_higher_id_keeps_what_is_its_own_besides_a_two_way_range(order: tupl
     assert isinstance(request, PairRequest)
     assert sorted(item.kind for item in request.measurements) == ["bearing", "range"]
     assert subject.counters["pair.not_owner"] == 1
+
+
+def test_no_contact_is_opened_to_a_peer_whose_clock_is_of_no_use() -> None:
+    """And the measurement that goes unused has its reason; once nothing speaks against the clock, it goes on."""
+    subject = agent()
+
+    def opened(t_s: int) -> int:
+        made = subject.handle(Observation(t_s * NS, t_s * NS, "range", "r2", np.array([4.0]), np.array([[0.01]])))
+        made += subject.handle(Tick((t_s + 1) * NS))
+        return sum(isinstance(effect, Send) and isinstance(effect.body, PairRequest) for effect in made)
+
+    assert opened(1) == 1
+    subject.handle(ClockJudged(10 * NS, "r2", "offset"))
+    assert opened(10) == 0
+    assert subject.counters["observation.clock_unusable"] == 1
+    subject.handle(ClockJudged(20 * NS, "r2", None))
+    assert opened(20) == 1
+    assert subject.counters["observation.clock_unusable"] == 1
 
 
 def test_buffers_are_bounded() -> None:

@@ -1,4 +1,4 @@
-"""The live table of a run says whose contacts are not used, why and until when."""
+"""The live table says why nothing happens: whose contacts are not used, why and until when."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.console import Console
 
 from agent.health import Health
 from agent.settings import NS, HealthSettings
-from deploy.status import LiveTable
+from deploy.status import LiveTable, _cells
 from sim.scenario_file import load
 
 
@@ -31,3 +31,16 @@ def test_a_quarantine_is_told_with_its_reason_and_its_end() -> None:
     assert "UNSAFE: accept_stale injected: range_m 60, hysteresis_m 2, loss 0.5" in shown
     assert "r2: r1 is quarantined for 10 s: mean NIS of its contacts was 12.0" in shown
     assert "consistent ones have 1; until 8 contacts in a row" in shown
+
+
+def test_a_neighbour_whose_clock_is_of_no_use_is_named_with_the_reason() -> None:
+    clock = {"offset_s": 2.0, "sigma_s": 0.001, "steps": 0, "unusable": "offset"}
+    status = {
+        "x_m": 0.0,
+        "y_m": 0.0,
+        "sigma_m": 0.1,
+        "lag_s": 0.0,
+        "peers": {"r2": True, "r3": True, "r4": False},
+        "clocks": {"r2": clock, "r3": {**clock, "unusable": None}},
+    }
+    assert _cells(None, status)[1] == "[red]r2 (clock: offset)[/red] r3"

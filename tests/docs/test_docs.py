@@ -6,12 +6,14 @@ import re
 import shlex
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
 
 from deploy.cli import parser
 from sim.scenario_file import bundled, load
+from tests.sizes import THOROUGH
 
 pytestmark = pytest.mark.realtime
 
@@ -68,6 +70,41 @@ def test_a_readme_run_works_as_written_but_shorter(tmp_path: Path) -> None:
     for name in ("scenario.toml", "summary.json", "report.html", "recording.mcap", "trace.npz", "fates.csv"):
         assert name in told
         assert (run / name).exists()
+
+
+def promises() -> list[str]:
+    """What README promises under faults, item by item."""
+    text = (ROOT / "README.md").read_text()
+    begin, end = text.index("What holds then, in numbers"), text.index("After a restart a robot goes on")
+    return re.findall(r"^- .*(?:\n  .*)*", text[begin:end], re.MULTILINE)
+
+
+@pytest.mark.parametrize("promise", promises(), ids=lambda promise: promise[2:30])
+def test_a_promise_has_a_number_and_a_test_that_exists(promise: str) -> None:
+    links = re.findall(r"\[(\w+)\]\(([\w/.]+)#(\w+)\)", promise)
+    assert links, "no test is linked"
+    assert re.search(r"\d|bit", re.sub(r"\[.*?\]\(.*?\)", "", promise)), "no number"
+    for label, path, name in links:
+        assert label == name
+        assert re.search(rf"^def {name}\(", (ROOT / path).read_text(), re.MULTILINE), f"{path} has no {name}"
+
+
+def test_the_readme_s_test_of_a_fleet_passes(tmp_path: Path) -> None:
+    """In virtual time; both runtimes are in tests/examples."""
+    text = (ROOT / "README.md").read_text()
+    (block,) = re.findall(r"^    import pytest\n(?:(?:    .*)?\n)*", text, re.MULTILINE)
+    (tmp_path / "test_own.py").write_text(textwrap.dedent(block))
+    which = [] if THOROUGH else ["-k", "virtual"]
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "pytest", "-q", "-p", "no:cacheprovider", *which, "test_own.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert ("2 passed" if THOROUGH else "1 passed") in done.stdout
 
 
 def test_the_map_names_files_that_exist() -> None:

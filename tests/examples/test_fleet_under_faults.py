@@ -8,6 +8,7 @@ import pytest
 
 from agent.config_file import ConfigError
 from deploy.testing import FleetMaker, fleet
+from sim.invariants import InvariantBreach
 
 __all__ = ["fleet"]
 
@@ -25,6 +26,28 @@ def test_a_partition_is_survived_and_forgotten(fleet: FleetMaker) -> None:
     robots.heal()
     robots.run_for(10.0)
     assert robots.status("r3")["pairs"]["r1"] > 16_000_000_000
+    robots.assert_consistent()
+
+
+@pytest.mark.parametrize("runtime", ["virtual", pytest.param("processes", marks=pytest.mark.realtime)])
+def test_one_story_in_virtual_time_and_in_real_processes(fleet: FleetMaker, runtime: str) -> None:
+    """`speed` makes the example short; without it real processes take the time the world does."""
+    speed = 2.5 if runtime == "processes" else 1.0
+    robots = fleet(OWN, QUIET, "fault_plan.processes=false", "duration_s=90.0", runtime=runtime, speed=speed, seed=3)
+    robots.run_until(4.0)
+    cut = robots.partition(["r1", "r2"], ["r3", "r4", "r5"])
+    robots.link("r3", "r4").loss = 0.5
+    robots.kill("r5")
+    robots.run_for(1.0)
+    since_ns = robots.status("r3")["pairs"]["r1"]
+    assert robots.status("r5") == {} and robots.status("r1")["state"] == "running"
+    robots.run_until(9.0)
+    assert robots.status("r3")["pairs"]["r1"] == since_ns
+    robots.heal()
+    assert not robots.end(cut)
+    robots.run_for(6.0)
+    assert robots.status("r3")["pairs"]["r1"] > since_ns + 1_000_000_000
+    assert math.isnan(robots.error_m("r5")) and robots.error_m("r3") < 5.0
     robots.assert_consistent()
 
 
@@ -66,6 +89,14 @@ def test_pauses_sensor_faults_and_isolation_leave_the_fleet_honest(fleet: FleetM
     robots.assert_consistent()
 
 
+def test_invariants_may_be_watched(fleet: FleetMaker, monkeypatch: pytest.MonkeyPatch) -> None:
+    robots = fleet(OWN, check=True)
+    robots.run_for(2.0)
+    monkeypatch.setattr("sim.invariants.MAX_COUNTERS", 0)
+    with pytest.raises(InvariantBreach, match="counters"):
+        robots.run_for(2.0)
+
+
 def test_two_fleets_of_one_seed_are_the_same(fleet: FleetMaker) -> None:
     one, two = fleet(OWN, seed=9), fleet(OWN, seed=9)
     for robots in (one, two):
@@ -85,6 +116,14 @@ def test_what_makes_no_sense_is_refused_with_the_remedy(fleet: FleetMaker) -> No
         robots.inject("loss", share=2.0)
     with pytest.raises(ConfigError, match="kind"):
         robots.inject("earthquake")
+    with pytest.raises(ConfigError, match="r1 has no sensor 'sonar'"):
+        robots.inject("sensor_dropout", robot="r1", sensor="sonar")
+    with pytest.raises(ConfigError, match="virtual, processes"):
+        fleet(OWN, runtime="field")
+    with pytest.raises(ConfigError, match="speed is for runtime='processes'"):
+        fleet(OWN, speed=2.0)
+    with pytest.raises(ConfigError, match="check is for runtime='virtual'"):
+        fleet(OWN, runtime="processes", check=True)
 
 
 def test_an_overconfident_robot_is_found(fleet: FleetMaker) -> None:

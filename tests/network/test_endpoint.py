@@ -316,6 +316,16 @@ def test_a_clock_that_is_set_right_again_is_used_again() -> None:
     assert len(deliveries(a.receive(T0 + 12 * S, b.send(T0 + 12 * S, "r1", T0 + 12 * S, reply())))) == 1
 
 
+def test_a_new_life_has_a_clock_that_nobody_has_judged_yet() -> None:
+    a, b = endpoint("r1"), endpoint("r2")
+    for k in range(3):
+        hello_round(a, b, T0 + k * S, 2 * S, 2 * MS)
+    assert a.peers()[0].clock_unusable == "offset"
+    again = endpoint("r2", boot_id=77)
+    told = [event for packet in again.tick(T0 + 20 * S)[0] for event in a.receive(T0 + 20 * S + MS, packet)]
+    assert ClockChange("r2", None) in told and a.peers()[0].clock_unusable is None
+
+
 @pytest.mark.parametrize("step_ns", [-100 * S, -10 * S, 10 * S, 100 * S])
 def test_a_clock_that_is_set_by_more_than_the_horizon_is_soon_understood_again(step_ns: int) -> None:
     a, b = endpoint("r1", clock_sigma_ns=50 * S), endpoint("r2", clock_sigma_ns=50 * S)
