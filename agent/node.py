@@ -11,7 +11,7 @@ from agent.effects import Alarm, Broadcast, Effect, Estimate, Persist, Publish, 
 from agent.events import Event, LinkChange, Received, Tick
 from agent.sensor_input import SensorConfig, SensorError, decode
 from agent.settings import AgentSettings
-from network.endpoint import ClockChange, Delivery, Endpoint, EndpointSettings, PeerChange
+from network.endpoint import ClockChange, Delivery, Endpoint, EndpointSettings, PeerChange, PeerDoubled
 from network.messages import Packet
 from network.wire import OversizeError
 
@@ -79,6 +79,8 @@ class Node:
         for item in self.endpoint.receive(now_ns, packet):
             if isinstance(item, ClockChange):
                 out.alarms.append(_clock_alarm(item))
+            elif isinstance(item, PeerDoubled):
+                out.alarms.append(Alarm("duplicate_robot", f"{item.peer}: {DOUBLED}"))
             elif isinstance(item, Delivery):
                 self._handle(Received(now_ns, item.message, item.offset_ns, item.offset_sigma_ns), out)
             else:
@@ -127,6 +129,7 @@ class Node:
             self.counters["send.degenerate"] += 1
 
 
+DOUBLED = "two processes send under this id; neither is believed until one of them is stopped"
 CLOCK_REASONS = {
     "steps": "it is set again and again",
     "offset": "it is off by far more than lateness.clock_sigma_s allows; set the clock, or enlarge that",
