@@ -96,9 +96,6 @@ class AgentShell:
 
     async def _open(self) -> None:
         config = self.config
-        if config.control_socket is not None:
-            self._control = ControlLine(self.robot)
-            await self._control.connect(config.control_socket)
         try:
             self._state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
             if not self._file.claim():
@@ -111,6 +108,9 @@ class AgentShell:
                 raise PermissionError(errno.EACCES, "permission denied")
         except OSError as error:
             raise ConfigError(f"state_dir {self._state_dir} cannot be written: {error.strerror}") from None
+        if config.control_socket is not None:
+            self._control = ControlLine(self.robot)
+            await self._control.connect(config.control_socket)
         if config.zenoh.insecure_lan:
             log.warning("zenoh.insecure_lan: messages to peers are neither encrypted nor authenticated")
         self._boot_id = secrets.randbits(53)
