@@ -6,6 +6,7 @@ with a real autopilot: the configuration refuses it.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 from collections.abc import Callable
 from dataclasses import replace
@@ -43,16 +44,27 @@ class Injection:
         self._forgers: list[Forger] = []
         self._spans: dict[str, tuple[int, int]] = {}
         self._start_ns = 0
+        self.failure: str | None = None
+        """Why the fate log is not written any more."""
         log: Callable[[FateRecord], None] | None = None
         if part.fate_log is not None:
             self._file = Path(part.fate_log).open("w", newline="")  # noqa: SIM115
-            rows = csv.writer(self._file)
-
-            def log(record: FateRecord) -> None:
-                rows.writerow(fate_row(record))
-
+            self._rows = csv.writer(self._file)
+            log = self._log_fate
         self.links = LinkModel(part.links.settings(part.seed), self._table.state, log)
         self._injector = LinkInjector(robot, self.links, true_ns, call_later, deliver, self._sent_at)
+
+    def _log_fate(self, record: FateRecord) -> None:
+        if self.failure is None:
+            try:
+                self._rows.writerow(fate_row(record))
+            except OSError as error:
+                self._fail(error)
+
+    def _fail(self, error: OSError) -> None:
+        self.failure = error.strerror or type(error).__name__
+        with contextlib.suppress(OSError):
+            self._file.close()
 
     async def open(self) -> None:
         """Learn from the world who hears whom."""
@@ -135,6 +147,9 @@ class Injection:
 
     async def close(self) -> None:
         if self._file is not None:
-            self._file.close()
+            try:
+                self._file.close()
+            except OSError as error:
+                self._fail(error)
         if self._feed is not None:
             await self._feed.close()

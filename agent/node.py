@@ -12,7 +12,7 @@ from agent.effects import Alarm, Broadcast, Effect, Estimate, Persist, Publish, 
 from agent.events import ClockJudged, Event, LinkChange, Received, Tick
 from agent.sensor_input import SensorConfig, SensorError, decode
 from agent.settings import AgentSettings
-from network.endpoint import ClockChange, Delivery, Endpoint, EndpointSettings, PeerChange
+from network.endpoint import ClockChange, Delivery, Endpoint, EndpointSettings, PeerChange, PeerDoubled
 from network.messages import Packet
 from network.wire import OversizeError
 
@@ -81,6 +81,8 @@ class Node:
             if isinstance(item, ClockChange):
                 out.alarms.append(_clock_alarm(item))
                 self._handle(ClockJudged(now_ns, item.peer, item.reason), out)
+            elif isinstance(item, PeerDoubled):
+                out.alarms.append(Alarm("duplicate_robot", f"{item.peer}: {DOUBLED}"))
             elif isinstance(item, Delivery):
                 self._handle(Received(now_ns, item.message, item.offset_ns, item.offset_sigma_ns), out)
             else:
@@ -119,6 +121,7 @@ class Node:
             **self.agent.status(),
             "peers": {peer.peer: peer.up for peer in peers},
             "clocks": clocks,
+            "duplicates": [peer.peer for peer in peers if peer.doubled],
             "rejected": rejected(self),
         }
 
@@ -150,6 +153,7 @@ class Node:
             self.counters["send.degenerate"] += 1
 
 
+DOUBLED = "two processes send under this id; neither is believed until one of them is stopped"
 CLOCK_REASONS = {
     "steps": "it is set again and again",
     "offset": "it is off by far more than lateness.clock_sigma_s allows; set the clock, or enlarge that",

@@ -134,6 +134,10 @@ class RecordingWriter:
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._file.close()
 
+    def abandon(self) -> None:
+        """Give an unfinished file up. Raises OSError."""
+        self._file.close()
+
 
 def _records(path: Path, unfinished: bool) -> Iterator[Any]:
     """Raw records of a file in order. Raises `RecordingError`; an unfinished file may be read up to its end."""

@@ -13,7 +13,6 @@ import logging
 import os
 import secrets
 import signal
-import socket
 import time
 from collections import Counter
 from dataclasses import replace
@@ -31,9 +30,10 @@ from agent.events import Event
 from agent.fleet_clock import FleetClock
 from agent.injection import Injection
 from agent.lateness_figures import LatenessFigures
+from agent.live_recording import LiveRecording
 from agent.mavlink import MavlinkError, MavlinkLink
 from agent.node import Node, Outgoing, rejected
-from agent.recording import RecordingWriter
+from agent.sensor_socket import SensorSocket
 from agent.settings import nanoseconds
 from agent.state_file import StateFile
 from agent.state_keeper import Start, StateKeeper, start
@@ -46,15 +46,6 @@ SOFTWARE = "cofix-0.1.0"
 PUBLISH_INTERVAL_S = 0.1
 STATUS_INTERVAL_S = 0.5
 ALARM_INTERVAL_S = 60.0
-MAX_SOCKET_PATH = 100
-
-
-class _SensorProtocol(asyncio.DatagramProtocol):
-    def __init__(self, shell: AgentShell) -> None:
-        self._shell = shell
-
-    def datagram_received(self, data: bytes, addr: Any) -> None:
-        self._shell.on_sensor(data)
 
 
 class AgentShell:
@@ -70,10 +61,10 @@ class AgentShell:
         self._mavlink: MavlinkLink | None = None
         self._reader: AutopilotReader | None = None
         self._injection: Injection | None = None
-        self._recording: RecordingWriter | None = None
+        self._recording: LiveRecording | None = None
         self._control: ControlLine | None = None
         self._hearing: asyncio.Task[None] | None = None
-        self._sensor_transport: asyncio.BaseTransport | None = None
+        self._sensors = SensorSocket(self._state_dir, self.on_sensor)
         self._receive: Any = None
         self._timer: asyncio.TimerHandle | None = None
         self._timer_due_ns = self._timer_set_ns = self._start_ns = 0
@@ -105,11 +96,13 @@ class AgentShell:
 
     async def _open(self) -> None:
         config = self.config
-        if config.control_socket is not None:
-            self._control = ControlLine(self.robot)
-            await self._control.connect(config.control_socket)
         try:
             self._state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if not self._file.claim():
+                raise ConfigError(
+                    f"state_dir {self._state_dir} is in use: an agent runs with it already; stop that one, or choose "
+                    "another state_dir if this is another robot"
+                )
             self._found = self._file.read()
             if not os.access(self._state_dir, os.W_OK):
                 raise PermissionError(errno.EACCES, "permission denied")
@@ -117,6 +110,9 @@ class AgentShell:
             raise ConfigError(f"state_dir {self._state_dir} cannot be written: {error.strerror}") from None
         for switch in config.unsafe.settings().named():
             log.warning("UNSAFE: unsafe.%s turns a protection off: estimates may claim more than they know", switch)
+        if config.control_socket is not None:
+            self._control = ControlLine(self.robot)
+            await self._control.connect(config.control_socket)
         if config.zenoh.insecure_lan:
             log.warning("zenoh.insecure_lan: messages to peers are neither encrypted nor authenticated")
         self._boot_id = secrets.randbits(53)
@@ -142,22 +138,7 @@ class AgentShell:
             self._receive = self._injection.on_packet
         self._transport = ZenohTransport(settings, lambda packet: self._receive(packet))
         await self._transport.start()
-        await self._open_sensor_socket()
-
-    async def _open_sensor_socket(self) -> None:
-        path = self._state_dir / "sensors.sock"
-        if len(os.fsencode(path)) > MAX_SOCKET_PATH:
-            raise ConfigError(f"state_dir {self._state_dir} is too long for a socket: choose a shorter path")
-        path.unlink(missing_ok=True)
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        previous = os.umask(0o177)
-        try:
-            listener.bind(str(path))
-        finally:
-            os.umask(previous)
-        listener.setblocking(False)
-        loop = asyncio.get_running_loop()
-        self._sensor_transport, _ = await loop.create_datagram_endpoint(lambda: _SensorProtocol(self), sock=listener)
+        await self._sensors.open()
 
     async def _started(self) -> bool:
         """Wait at the barrier and set the clock; False when stopped before the start."""
@@ -213,10 +194,9 @@ class AgentShell:
         self._start_ns = start_ns
         begin = self._restored(start_ns)
         if config.recording is not None:
-            self._recording = RecordingWriter(Path(config.recording))
-            self._recording.add_robot(config, start_ns)
+            self._recording = LiveRecording(Path(config.recording), config, start_ns)
             if begin.again or begin.state is not None:
-                self._recording.begin_life(self.robot, start_ns, begin.state)
+                self._recording.begin_life(start_ns, begin.state)
         self._node = Node(
             begin.settings,
             config.network.settings(config.lateness, config.unsafe.settings()),
@@ -224,7 +204,7 @@ class AgentShell:
             incarnation=begin.incarnation,
             software=SOFTWARE,
             sensors=config.sensor_configs(),
-            recorder=self._record if self._recording is not None else None,
+            recorder=self._recording.record if self._recording is not None else None,
             state=begin.state,
         )
         if config.mavlink is not None:
@@ -256,10 +236,6 @@ class AgentShell:
                 return
             await asyncio.sleep(0.1)
         raise MavlinkError(f"mavlink.endpoint {endpoint}: nothing answers; start the autopilot or correct the endpoint")
-
-    def _record(self, event: Event, effects: list[Any]) -> None:
-        assert self._recording is not None
-        self._recording.record(self.robot, event, effects)
 
     # -- work -----------------------------------------------------------------------------------------------
 
@@ -309,7 +285,7 @@ class AgentShell:
                 self._transport.send(packet)
             else:
                 self.counters["state.held_back"] += 1
-        for alarm in (*out.alarms, *self._keeper.alarms()):
+        for alarm in (*out.alarms, *self._troubles()):
             self._warn(alarm)
         if out.estimates:
             wall = time.monotonic()
@@ -346,6 +322,10 @@ class AgentShell:
             return {"robot": self.robot, "state": "waiting for the start"}
         status = self._node.status()
         status["state_file"] = dict(self.counters)
+        status["troubles"] = {trouble.reason: trouble.detail for trouble in self._troubles()}
+        status["silence_max_s"] = {peer.peer: peer.silence_max_ns * 1e-9 for peer in self._node.endpoint.peers()}
+        if self._transport is not None:
+            status["transport"] = dict(self._transport.counters)
         status["lag_max_s"] = self._lags.max_ns * 1e-9
         injection = self.config.injection
         status["injected"] = injection.links.model_dump(exclude_defaults=True) if injection is not None else {}
@@ -354,6 +334,14 @@ class AgentShell:
         if self._reader is not None:
             status["autopilot"] = self._reader.status()
         return status
+
+    def _troubles(self) -> list[Alarm]:
+        """What is wrong on this computer, as long as it is so."""
+        found = self._keeper.alarms() if self._keeper is not None else []
+        for name, file in (("recording", self._recording), ("fate_log", self._injection)):
+            if file is not None and file.failure is not None:
+                found.append(Alarm(f"{name}.failed", file.failure))
+        return found
 
     def _figures(self) -> dict[str, Any]:
         """What the launcher needs for the summary."""
@@ -383,13 +371,12 @@ class AgentShell:
         self._receive = _ignore
         if self._mavlink is not None:
             await self._mavlink.close()
-        if self._sensor_transport is not None:
-            self._sensor_transport.close()
-        (self._state_dir / "sensors.sock").unlink(missing_ok=True)
+        self._sensors.close()
         if self._recording is not None:
             self._recording.close()
         if self._keeper is not None:
             await self._keeper.close(state)
+        self._file.release()
         if self._control is not None:
             if figures is not None:
                 self._control.say({"done": figures})

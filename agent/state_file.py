@@ -7,6 +7,7 @@ life begins, and its number is on disk before it is used.
 
 from __future__ import annotations
 
+import fcntl
 import os
 from dataclasses import dataclass
 from hashlib import blake2b
@@ -87,6 +88,7 @@ class StateFile:
     def __init__(self, state_dir: Path, robot: str, sync: bool = True) -> None:
         self._path, self._robot, self._sync = state_dir / FILE, robot, sync
         self._refused = state_dir / REFUSED
+        self._claim: int | None = None
 
     def read(self) -> Found:
         """What the last life has left. A file that cannot be used is kept aside as `state.bad`, one of them."""
@@ -108,6 +110,26 @@ class StateFile:
             return Found(None if aside is None else unpack(aside, self._robot)[0], None, reason)
         except (OSError, StateError):
             return Found(None, None, reason)
+
+    def claim(self) -> bool:
+        """Take the folder for this process as long as it lives; False if another one has it. Needs no space.
+
+        Raises OSError.
+        """
+        handle = os.open(self._path.parent, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(handle)
+            return False
+        self._claim = handle
+        return True
+
+    def release(self) -> None:
+        """Give the folder back."""
+        handle, self._claim = self._claim, None
+        if handle is not None:
+            os.close(handle)
 
     def _bytes(self, path: Path) -> bytes | None:
         try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,17 @@ LEASE_MS, LEASE_PER_ROBOT_MS = 1_000, 250
 again, and with forty of them that takes all the time there is."""
 
 
+@dataclass(frozen=True, slots=True)
+class Host:
+    """A network namespace that stands for a robot's computer, and the address its peers reach it at.
+
+    The autopilot stand-in stays on the loopback of the same namespace, as an autopilot beside its companion does.
+    """
+
+    namespace: str
+    address: str
+
+
 def agent_file(
     scenario: Scenario,
     world: World,
@@ -32,10 +45,12 @@ def agent_file(
     run_dir: Path,
     state_dir: Path,
     ports: dict[str, int],
+    hosts: Mapping[str, Host],
 ) -> dict[str, Any]:
     """The file of one agent: what is common to all runtimes, plus endpoints, clock and injection."""
     tables = agent_tables(scenario, world, robot)
-    endpoints = {name: list(link_pair("127.0.0.1", port)) for name, port in ports.items()}
+    places = {name: hosts[name].address if name in hosts else "127.0.0.1" for name in ports}
+    endpoints = {name: list(link_pair(places[name], port)) for name, port in ports.items()}
     lateness = tables["lateness"]
     lateness["settle_s"] = max(lateness["settle_s"], SETTLE_WALL_S * speed)
     lateness["tolerance_s"] = max(lateness["tolerance_s"], STAMP_WALL_S * speed)
@@ -61,6 +76,7 @@ def agent_file(
         "zenoh": {
             "listen": endpoints[robot.id],
             "peers": [{"id": name, "endpoints": value} for name, value in endpoints.items() if name != robot.id],
+            "insecure_lan": robot.id in hosts,
             "lease_ms": max(LEASE_MS, LEASE_PER_ROBOT_MS * len(endpoints)),
         },
         "mavlink": mavlink,
@@ -72,7 +88,7 @@ def agent_file(
                 for name, fault in trial_faults(scenario, seed).items()
                 if fault.level in ("link", "forgery", "clock")
             ],
-            "table": plan.link_endpoint,
+            **({} if hosts else {"table": plan.link_endpoint}),
             "fate_log": str(life_file(run_dir, robot.id, 1, "fates.csv")),
         },
         "state_dir": str(state_dir / robot.id),

@@ -15,15 +15,16 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import tomli_w
 
+from agent.config_file import ConfigError
 from agent.settings import NS
-from deploy.agent_files import agent_file
+from deploy.agent_files import Host, agent_file
 from deploy.exit_words import ended
 from deploy.fault import SOCKET
 from deploy.life_figures import summed
@@ -63,7 +64,19 @@ class Outcome:
 class Launcher:
     """Starts, watches and ends the processes of one run."""
 
-    def __init__(self, scenario: Scenario, world: World, seed: int, speed: float, run_dir: Path) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        world: World,
+        seed: int,
+        speed: float,
+        run_dir: Path,
+        hosts: Mapping[str, Host] | None = None,
+    ) -> None:
+        """`hosts`: network namespaces the agents run in (absent: all on loopback); needs root. Raises `ConfigError`."""
+        self._hosts = hosts or {}
+        if self._hosts and scenario.links.range_m is not None:
+            raise ConfigError("links.range_m: who hears whom cannot be told to agents in namespaces; leave it out")
         self._scenario, self._world, self._seed, self._speed = scenario, world, seed, speed
         self._run_dir = run_dir
         self.members: dict[str, Member] = {}
@@ -71,7 +84,8 @@ class Launcher:
         self._changed = asyncio.Event()
         self._interrupted = False
         self._t0_ns = 0
-        self._begin: dict[str, int] | None = None
+        self.begin: dict[str, int] | None = None
+        """When the run's clock starts, as it is told to all; None before the barrier."""
         self._faults = LiveFaults(
             scenario, seed, lambda: self.t_s(TOLD_S), self._tell_all, lambda *fault: self._nemesis.strike_soon(*fault)
         )
@@ -112,9 +126,9 @@ class Launcher:
 
     def t_s(self, ahead_s: float = 0.0) -> float:
         """The instant of the run, or that in so much wall time, in seconds of fleet time since its start."""
-        if self._begin is None:
+        if self.begin is None:
             return 0.0
-        wall_ns = time.monotonic_ns() - self._begin["monotonic0_ns"] + int(ahead_s * NS)
+        wall_ns = time.monotonic_ns() - self.begin["monotonic0_ns"] + int(ahead_s * NS)
         return max(wall_ns / NS * self._speed, 0.0)
 
     @property
@@ -124,7 +138,7 @@ class Launcher:
 
     def injected(self) -> list[str]:
         """Names of the faults that are on now."""
-        return self._faults.active(self.t_s()) if self._begin is not None else []
+        return self._faults.active(self.t_s()) if self.begin is not None else []
 
     def played(self) -> Scenario:
         """The scenario with the faults there were, those by hand too."""
@@ -149,6 +163,7 @@ class Launcher:
             link_endpoint=f"tcp/127.0.0.1:{port()}",
             mavlink_ports={name: port() for name in robots},
             sensor_sockets={name: str(private / name / "sensors.sock") for name in robots},
+            namespaces={name: host.namespace for name, host in self._hosts.items()},
         )
         (private / "plan.json").write_text(plan_json(plan))
         agents = self._run_dir / "agents"
@@ -156,7 +171,16 @@ class Launcher:
         (self._run_dir / "logs").mkdir(exist_ok=True)
         for robot in self._scenario.robots:
             tables = agent_file(
-                self._scenario, self._world, robot, self._seed, self._speed, plan, self._run_dir, private, ports
+                self._scenario,
+                self._world,
+                robot,
+                self._seed,
+                self._speed,
+                plan,
+                self._run_dir,
+                private,
+                ports,
+                self._hosts,
             )
             with (agents / f"{robot.id}.toml").open("wb") as file:
                 tomli_w.dump(tables, file)
@@ -169,7 +193,8 @@ class Launcher:
 
     async def _spawn(self, name: str, *arguments: str, life: int = 1) -> None:
         log = self._run_dir / "logs" / f"{name}.log"
-        self.members[name] = await spawn(name, log, arguments, life, self._changed.set)
+        namespace = self._hosts[name].namespace if name in self._hosts else None
+        self.members[name] = await spawn(name, log, arguments, life, self._changed.set, namespace)
 
     async def _spawn_agent(self, robot: str, config: Path, life: int = 1) -> None:
         await self._spawn(robot, "-m", "deploy.cli", "agent", str(config), life=life)
@@ -186,8 +211,8 @@ class Launcher:
                 member.writer = writer
                 member.heard_s = time.monotonic()
                 member.ready = member.ready or "ready" in message
-                if "ready" in message and self._begin is not None:
-                    member.tell({"start": {**self._begin, "changes": self._faults.changes}})
+                if "ready" in message and self.begin is not None:
+                    member.tell({"start": {**self.begin, "changes": self._faults.changes}})
                     member.told = True
                 if "status" in message:
                     member.status = message["status"]
@@ -208,11 +233,11 @@ class Launcher:
                 raise LaunchError(f"{late} not ready after {READY_TIMEOUT_S:.0f} s; see {self._run_dir / 'logs'}")
             await self._wait(0.2)
         self._t0_ns = time.time_ns() // NS * NS
-        self._begin = {"t0_ns": self._t0_ns, "monotonic0_ns": time.monotonic_ns() + int(LEAD_S * NS)}
+        self.begin = {"t0_ns": self._t0_ns, "monotonic0_ns": time.monotonic_ns() + int(LEAD_S * NS)}
         for member in self.members.values():
-            member.tell({"start": self._begin})
+            member.tell({"start": self.begin})
             member.told = True
-        self._nemesis.begin(self._begin["monotonic0_ns"])
+        self._nemesis.begin(self.begin["monotonic0_ns"])
 
     # -- work and end ---------------------------------------------------------------------------------------
 

@@ -50,11 +50,20 @@ class Member:
         changed()
 
 
-async def spawn(name: str, log: Path, arguments: tuple[str, ...], life: int, changed: Callable[[], None]) -> Member:
-    """Start a process of our own interpreter; `changed` is called when it has ended."""
+async def spawn(
+    name: str,
+    log: Path,
+    arguments: tuple[str, ...],
+    life: int,
+    changed: Callable[[], None],
+    namespace: str | None = None,
+) -> Member:
+    """Start a process of our own interpreter, in a network `namespace`; `changed` is called when it has ended."""
+    entered = () if namespace is None else ("nsenter", f"--net=/run/netns/{namespace}")
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
     with log.open("ab" if life > 1 else "wb") as output:
         process = await asyncio.create_subprocess_exec(
+            *entered,
             sys.executable,
             "-P",
             *arguments,

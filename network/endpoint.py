@@ -13,6 +13,7 @@ each refusal is counted as `rejected.<reason>`. Reasons besides those of `networ
     duplicate          accepted already
     too_old_seq        so far behind that it cannot be told from a duplicate
     too_many_peers     the peer table is full
+    duplicate_robot    two processes send under the sender's id
     clock_unusable     the sender's clock is beyond repair: its stamps mean nothing
 
 `received = delivered + hellos + sum of rejected.*` holds at all times.
@@ -114,10 +115,18 @@ class ClockChange:
 
 
 @dataclass(frozen=True, slots=True)
+class PeerDoubled:
+    """Two processes are seen to send under a peer's id."""
+
+    peer: str
+
+
+@dataclass(frozen=True, slots=True)
 class PeerStatus:
     """What is known of one peer, for people: `counts` has accepted, rejected, lives, clock_refused.
 
-    `clock_unusable`: why its clock is of no use; None: it is.
+    `clock_unusable`: why its clock is of no use; None: it is. `silence_max_ns`: longest time between two messages.
+    `doubled`: two processes send under its id.
     """
 
     peer: str
@@ -130,6 +139,8 @@ class PeerStatus:
     clock_steps: int
     clock_unusable: str | None
     counts: dict[str, int]
+    silence_max_ns: int = 0
+    doubled: bool = False
 
 
 class Endpoint:
@@ -159,6 +170,7 @@ class Endpoint:
         self._hello_due_ns: int | None = None
         self._echo_turn = 0
         self._clock_changes: list[ClockChange] = []
+        self._doubled: list[PeerDoubled] = []
         encode(self._header(0, 0, 0), Hello(software))
 
     # --- out ----------------------------------------------------------------------------------------------
@@ -220,11 +232,12 @@ class Endpoint:
 
     # --- in -----------------------------------------------------------------------------------------------
 
-    def receive(self, now_ns: int, packet: Packet) -> list[Delivery | PeerChange | ClockChange]:
+    def receive(self, now_ns: int, packet: Packet) -> list[Delivery | PeerChange | ClockChange | PeerDoubled]:
         """What a packet means to the layer above: nothing, a change of its sender, a message, or both."""
         self.counters["received"] += 1
         self.counters["received_bytes"] += len(packet.payload)
         self._clock_changes = []
+        self._doubled = []
         try:
             return [*self._receive(now_ns, packet), *self._clock_changes]
         except WireError as error:
@@ -232,7 +245,7 @@ class Endpoint:
             peer = self._table.get(packet.source)
             if peer is not None:
                 peer.counters["rejected"] += 1
-            return list(self._clock_changes)
+            return [*self._clock_changes, *self._doubled]
 
     def _receive(self, now_ns: int, packet: Packet) -> list[Delivery | PeerChange]:
         message = self._admissible(packet)
@@ -240,9 +253,10 @@ class Endpoint:
         fresh: Hello | None = None
         peer = self._table.get(header.source)
         if peer is not None:
-            refusal = peer.refusal(
-                header.t_send_ns, header.boot_id, header.incarnation, packet.channel, header.seq
-            )
+            refusal = peer.refusal(header.t_send_ns, header.boot_id, header.incarnation, packet.channel, header.seq)
+            if refusal == "old_life" and peer.outlived(now_ns, header.t_send_ns):
+                self.counters["doubled"] += 1
+                self._doubled.append(PeerDoubled(peer.robot))
             if refusal is not None and not (self.settings.accept_duplicates and refusal in REPEATED):
                 raise WireError(refusal)
         if isinstance(body, Hello) and peer is not None and not peer.is_new_life(header.boot_id, header.incarnation):
@@ -252,6 +266,9 @@ class Endpoint:
             fresh = body
         if not isinstance(body, Hello) or self._knows_clock(now_ns, header, peer):
             self._check_age(now_ns, header, peer)
+        doubled = peer is not None and peer.doubled(now_ns, self.settings.silent_after_ns)
+        if doubled and not isinstance(body, Hello):
+            raise WireError("duplicate_robot")
         if peer is not None and peer.clock_unusable is not None and not isinstance(body, Hello):
             raise WireError("clock_unusable")
         if peer is None:
@@ -342,6 +359,8 @@ class Endpoint:
                 peer.clock.steps,
                 peer.clock_unusable,
                 dict(peer.counters),
+                peer.silence_max_ns,
+                peer.doubled_ns is not None,
             )
             for peer in self._table.sorted()
         )

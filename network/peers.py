@@ -3,7 +3,8 @@
 A life of a robot is a pair (incarnation, boot id). A new life has a higher incarnation, or the same one, a
 boot id not superseded before, and was sent later than everything heard of the present life: without the last
 condition a straggler of a boot that ended before we first listened would supersede the living one for good.
-Messages of earlier lives are refused.
+Messages of earlier lives are refused. An earlier life that goes on sending after the next has begun means that two
+processes bear one id: which of them is the robot nobody can know, so neither is believed until one is silent.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from collections import Counter, deque
 from network.clock import PeerClock
 
 WINDOW = 1024
+DOUBLED_AFTER = 3
+"""So many messages in a row, sent by a former life after the present one has begun, are no stragglers."""
 MAX_PEERS = 64
 MAX_BOOT_IDS = 16
 """Superseded boot ids remembered per peer; sixteen restarts outlast every message still under way."""
@@ -58,7 +61,12 @@ class Peer:
         self.up = False
         self.heard_ns = 0
         self.sent_ns = 0
+        self.silence_max_ns = 0
+        """Longest time between two messages."""
         self._latest_sent_ns = -1
+        self._began_ns: int | None = None
+        self._outlived = 0
+        self.doubled_ns: int | None = None
         self.clock = PeerClock()
         self.clock_unusable: str | None = None
         self.counters: Counter[str] = Counter()
@@ -86,6 +94,22 @@ class Peer:
             return None
         return window.refusal(seq)
 
+    def outlived(self, now_ns: int, t_send_ns: int) -> bool:
+        """Take a message of a former life; True if by it two processes are seen to bear this robot's id."""
+        if self._began_ns is None or t_send_ns <= self._began_ns:
+            return False
+        self._outlived += 1
+        if self._outlived < DOUBLED_AFTER:
+            return False
+        first, self.doubled_ns = self.doubled_ns is None, now_ns
+        return first
+
+    def doubled(self, now_ns: int, silent_after_ns: int) -> bool:
+        """Whether two processes bear this robot's id: until the former one is silent for `silent_after_ns`."""
+        if self.doubled_ns is not None and not 0 <= now_ns - self.doubled_ns < silent_after_ns:
+            self.doubled_ns, self._outlived = None, 0
+        return self.doubled_ns is not None
+
     def accept(self, now_ns: int, t_send_ns: int, boot_id: int, incarnation: int, channel: str, seq: int) -> bool:
         """Record a message that was not refused; True if the peer came up or began a new life with it."""
         changed = not self.up
@@ -95,10 +119,13 @@ class Peer:
             self.boot_id, self.incarnation = boot_id, incarnation
             self._windows.clear()
             self._latest_sent_ns = -1
+            self._began_ns, self._outlived = t_send_ns, 0
             self.clock, self.clock_unusable = PeerClock(), None
             self.counters["lives"] += 1
             changed = True
         self._windows.setdefault(channel, DuplicateWindow()).record(seq)
+        if self.counters["accepted"]:
+            self.silence_max_ns = max(self.silence_max_ns, now_ns - self.heard_ns)
         self.up = True
         self.heard_ns, self.sent_ns = now_ns, t_send_ns
         self._latest_sent_ns = max(self._latest_sent_ns, t_send_ns)
@@ -139,6 +166,7 @@ class PeerTable:
             peer.heard_ns = min(peer.heard_ns, now_ns)
             if peer.up and now_ns - peer.heard_ns >= self.silent_after_ns:
                 peer.up = False
+                peer.doubled(now_ns, self.silent_after_ns)
                 # Whatever its clock said may have changed unseen.
                 peer.clock = PeerClock()
                 silent.append(peer)

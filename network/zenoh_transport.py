@@ -1,11 +1,12 @@
 """Packets over Zenoh, peer to peer.
 
 Keys are `cofix/v1/<fleet>/<robot>/<channel>` and `.../pair/<peer>`; a robot writes only under its own name.
-Three properties of Zenoh decide the shape of this module:
+Four properties of Zenoh decide the shape of this module:
 
 - A dead TCP link occupies a receive thread for ten seconds: there are more threads than robots to lose.
 - Receive threads are shared by all links: the callback only copies and enqueues, and wakes the loop once.
 - A session dials only robots of lower id: mutual dialling can leave a link half dead for good.
+- A session that was lost, whatever took it, is not mended by itself: it is watched, and opened again.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import json
 import logging
 import os
 import threading
+import time
 from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any
@@ -28,6 +30,9 @@ from network.wire_fields import valid_id
 _LOG = logging.getLogger(__name__)
 _PREFIX = f"cofix/v{SCHEMA}"
 _MIN_RX_WORKERS = 8
+_WATCH_S = 1.0
+_PROBE_EVERY = 5
+_MIN_PATIENCE_S, _MAX_PATIENCE_S = 5.0, 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +94,10 @@ class ZenohTransport:
 
     Counters: sent, received, and everything lost: not_open, send_failed, queue_dropped, oversize, foreign_key,
     handler_failed, close_timeout. liveliness_up and liveliness_down count neighbours' tokens.
+
+    A session is lost when it is closed (`lost_closed`), when nobody can dial it any more (`lost_deaf`), or when all
+    are silent who were heard before (`lost_silent`; the patience doubles each time, up to a minute, for all may be
+    out of reach). It is opened again: `reopened`, `reopen_failed`.
     """
 
     def __init__(self, settings: ZenohSettings, on_packet: OnPacket) -> None:
@@ -99,6 +108,7 @@ class ZenohTransport:
         self._session: Any = None
         self._publishers: dict[str, Any] = {}
         self._declared: list[Any] = []
+        self._watcher: asyncio.Task[None] | None = None
         # Guards what the receive threads share with the loop: the three fields below and their counters.
         self._lock = threading.Lock()
         self._queue: deque[tuple[str, bytes]] = deque()
@@ -111,6 +121,10 @@ class ZenohTransport:
         """Open the session. Raises TransportError, with the endpoint and the remedy, if that cannot be."""
         if self._session is not None:
             raise TransportError("the transport is open already: close it first")
+        await self._open()
+        self._watcher = asyncio.create_task(self._watch())
+
+    async def _open(self) -> None:
         settings = self.settings
         workers = max(_MIN_RX_WORKERS, len(settings.connect) + 2)
         os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {workers}))")
@@ -126,7 +140,7 @@ class ZenohTransport:
         try:
             self._declare()
         except zenoh.ZError as error:
-            await self.close()
+            await self._shut()
             raise TransportError(f"zenoh refused the keys of robot {settings.robot}: {error}") from None
 
     def _declare(self) -> None:
@@ -136,9 +150,7 @@ class ZenohTransport:
         keys.append(f"{fleet}/*/{Channel.PAIR}/{settings.robot}")
         for key in keys:
             handler = zenoh.handlers.Callback(self._on_sample, indirect=False)
-            self._declared.append(
-                self._session.declare_subscriber(key, handler, allowed_origin=zenoh.Locality.REMOTE)
-            )
+            self._declared.append(self._session.declare_subscriber(key, handler, allowed_origin=zenoh.Locality.REMOTE))
         liveliness = self._session.liveliness()
         handler = zenoh.handlers.Callback(self._on_liveliness, indirect=False)
         self._declared.append(liveliness.declare_subscriber(f"{fleet}/*/alive/*", handler, history=True))
@@ -147,6 +159,13 @@ class ZenohTransport:
 
     async def close(self) -> None:
         """Close the session; gives up, and counts it, after `close_timeout_s`."""
+        watcher, self._watcher = self._watcher, None
+        if watcher is not None:
+            watcher.cancel()
+            await asyncio.gather(watcher, return_exceptions=True)
+        await self._shut()
+
+    async def _shut(self) -> None:
         session, self._session = self._session, None
         if session is None:
             return
@@ -162,6 +181,57 @@ class ZenohTransport:
         except TimeoutError:
             self.counters["close_timeout"] += 1
             _LOG.warning("zenoh session did not close within %s s", self.settings.close_timeout_s)
+
+    # --- watch --------------------------------------------------------------------------------------------
+
+    async def _watch(self) -> None:
+        """Look after the session, and open it again when it is lost."""
+        least_s = max(_MIN_PATIENCE_S, self.settings.lease_ms * 5e-3)
+        patience_s, received, heard_s, turn = least_s, 0, time.monotonic(), 0
+        while True:
+            await asyncio.sleep(_WATCH_S)
+            turn += 1
+            if self.counters["received"] != received:
+                received, heard_s, patience_s = self.counters["received"], time.monotonic(), least_s
+            reason = None
+            if self._session is None or self._session.is_closed():
+                reason = "closed"
+            elif turn % _PROBE_EVERY == 0 and await self._deaf():
+                reason = "deaf"
+            elif received and time.monotonic() - heard_s > patience_s:
+                reason, patience_s = "silent", min(2.0 * patience_s, _MAX_PATIENCE_S)
+            if reason is not None:
+                await self._again(reason)
+                heard_s = time.monotonic()
+
+    async def _again(self, reason: str) -> None:
+        self.counters[f"lost_{reason}"] += 1
+        _LOG.warning("zenoh session lost (%s): it is opened again", reason)
+        await self._shut()
+        try:
+            await self._open()
+        except TransportError as error:
+            self.counters["reopen_failed"] += 1
+            _LOG.warning("zenoh session not open: %s", error)
+        else:
+            self.counters["reopened"] += 1
+
+    async def _deaf(self) -> bool:
+        """Whether an own stream endpoint refuses connections."""
+        for endpoint in self.settings.listen:
+            protocol, _, address = endpoint.partition("?")[0].partition("/")
+            host, _, port = address.rpartition(":")
+            if protocol not in ("tcp", "tls"):
+                continue
+            try:
+                async with asyncio.timeout(_WATCH_S):
+                    _, writer = await asyncio.open_connection(host.strip("[]"), int(port))
+                writer.close()
+            except ConnectionRefusedError:
+                return True
+            except (OSError, ValueError, TimeoutError):
+                continue
+        return False
 
     # --- out ----------------------------------------------------------------------------------------------
 

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes
 import json
 import os
 import signal
 import socket
 import sys
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +53,7 @@ from sim.world import Output
 VEHICLES = {False: dialect.MAV_TYPE_GROUND_ROVER, True: dialect.MAV_TYPE_QUADROTOR}
 BOOT_LEAD_NS = 30_000_000_000
 FINAL_WALL_S = 0.5
+CLONE_NEWNET = 0x40000000
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,10 +67,37 @@ class HostPlan:
     link_endpoint: str
     mavlink_ports: dict[str, int]
     sensor_sockets: dict[str, str]
+    namespaces: dict[str, str] = field(default_factory=dict)
+    """Network namespaces of robots that have one of their own: their stand-ins speak there."""
 
     @staticmethod
     def read(path: Path) -> HostPlan:
         return HostPlan(**json.loads(path.read_text()))
+
+
+@contextlib.contextmanager
+def inside(namespace: str | None) -> Iterator[None]:
+    """Sockets that this thread opens within belong to a network namespace. Raises OSError."""
+    if namespace is None:
+        yield
+        return
+    here = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
+    try:
+        _enter(os.open(f"/run/netns/{namespace}", os.O_RDONLY))
+        try:
+            yield
+        finally:
+            _enter(os.dup(here))
+    finally:
+        os.close(here)
+
+
+def _enter(handle: int) -> None:
+    try:
+        if ctypes.CDLL(None, use_errno=True).setns(handle, CLONE_NEWNET) != 0:
+            raise OSError(ctypes.get_errno(), "the network namespace cannot be entered")
+    finally:
+        os.close(handle)
 
 
 class WorldHost:
@@ -165,7 +195,8 @@ class WorldHost:
                 vehicle_type=VEHICLES[LAYOUTS[part.model].altitude is not None],
             )
             server = StandInServer(StandIn(settings), f"udpout:127.0.0.1:{port}", clock)
-            await server.start()
+            with inside(self._plan.namespaces.get(robot)):
+                await server.start()
             self._servers[robot] = server
 
     async def _play(self, clock: FleetClock, control: ControlLine) -> None:

@@ -179,3 +179,14 @@ def test_every_new_life_has_a_later_number() -> None:
     assert next_incarnation(7, NOW) == 8
     assert next_incarnation(None, 0) == 1
     assert next_incarnation(None, NOW) > 5, "a lost disk starts above what was counted before"
+
+
+def test_a_folder_belongs_to_one_process_at_a_time(tmp_path: Path) -> None:
+    first, second = StateFile(tmp_path, "r1"), StateFile(tmp_path, "r1")
+    assert first.claim()
+    assert not second.claim()
+    second.release()
+    assert not second.claim()
+    first.release()
+    assert second.claim()
+    second.release()

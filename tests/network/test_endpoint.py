@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from network.endpoint import ClockChange, Delivery, Endpoint, EndpointSettings, PeerChange
+from network.endpoint import ClockChange, Delivery, Endpoint, EndpointSettings, PeerChange, PeerDoubled
 from network.messages import (
     MAX_ECHOES,
     MAX_MESSAGE_BYTES,
@@ -56,11 +56,11 @@ def counter_of(delivery: Delivery) -> int:
     return delivery.message.body.epoch.counter
 
 
-def deliveries(events: list[Delivery | PeerChange]) -> list[Delivery]:
+def deliveries(events: list[Any]) -> list[Delivery]:
     return [event for event in events if isinstance(event, Delivery)]
 
 
-def changes(events: list[Delivery | PeerChange]) -> list[PeerChange]:
+def changes(events: list[Any]) -> list[PeerChange]:
     return [event for event in events if isinstance(event, PeerChange)]
 
 
@@ -180,6 +180,25 @@ def test_a_stale_message_of_another_boot_does_not_begin_a_life() -> None:
     end.receive(T0, packet_from(boot_id=1))
     assert end.receive(T0, packet_from(boot_id=2, t_send_ns=T0 - HORIZON - 1)) == []
     assert end.peers()[0].boot_id == 1
+
+
+def test_two_processes_under_one_id_are_named_and_neither_is_believed_until_one_is_silent() -> None:
+    end, first, second = endpoint("r2"), endpoint("r1", boot_id=1), endpoint("r1", boot_id=2)
+    end.receive(T0, first.send(T0, "r2", T0, reply()))
+    end.receive(T0 + MS, second.send(T0 + MS, "r2", T0, reply(1)))
+    # A straggler of the first process is no second robot.
+    end.receive(T0 + 3 * MS, first.send(T0 + MS // 2, "r2", T0, reply(2)))
+    told = []
+    for k in range(4, 10):
+        now_ns = T0 + k * S // 10
+        told += end.receive(now_ns, first.send(now_ns, "r2", now_ns, reply(k)))
+    assert told == [PeerDoubled("r1")] and end.peers()[0].doubled
+    late_ns = T0 + 2 * S
+    assert deliveries(end.receive(late_ns, second.send(late_ns, "r2", late_ns, reply(10)))) == []
+    assert rejected(end) == {"rejected.old_life": 7, "rejected.duplicate_robot": 1}
+    healed_ns = T0 + 4 * S
+    assert len(deliveries(end.receive(healed_ns, second.send(healed_ns, "r2", healed_ns, reply(11))))) == 1
+    assert not end.peers()[0].doubled
 
 
 def test_a_crowd_beyond_the_table_is_refused() -> None:

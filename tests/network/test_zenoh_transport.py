@@ -192,6 +192,22 @@ def test_sending_before_the_start_and_after_the_end_is_counted() -> None:
     asyncio.run(scene())
 
 
+def test_a_session_that_was_closed_underneath_is_opened_again() -> None:
+    async def scene() -> None:
+        async with fleet_of("r1", "r2") as fleet:
+            await fleet.connected()
+            end = fleet.ends["r1"]
+            await asyncio.to_thread(end._session.close)
+            await fleet.until(lambda: end.counters["reopened"] == 1)
+            assert end.counters["lost_closed"] == 1
+            packet = Packet("r2", Channel.HELLO, None, b"again")
+            await fleet.until(
+                lambda: b"again" in fleet.payloads("r1"), again=lambda: fleet.ends["r2"].send(packet)
+            )
+
+    asyncio.run(scene())
+
+
 def test_a_session_that_does_not_close_is_given_up_and_counted() -> None:
     release = threading.Event()
 

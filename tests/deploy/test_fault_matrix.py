@@ -1,0 +1,327 @@
+"""Each fault of processes, disks and sessions, once, on real processes: the healthy stay honest, and it is named.
+
+The long ones are for `make check-matrix` (COFIX_MATRIX=1).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import json
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+import tomli_w
+import zenoh
+
+from agent.settings import NS
+from agent.state_file import FILE, REFUSED
+from tests.deploy.lan import Lan, missing
+from tests.deploy.played import Live, Played, play, scenario
+from tests.deploy.test_restart import locate
+from tests.desk_agent import DeskAgent, desk_agent
+
+COFIX = (sys.executable, "-P", "-m", "deploy.cli")
+LONG = pytest.mark.skipif(not os.environ.get("COFIX_MATRIX"), reason="long: make check-matrix")
+ALL = ("r1", "r2", "r3", "r4")
+SILENT_S = 1.5
+"""No healthy pair is silent for longer, whoever else is lost."""
+
+
+def assert_all_well(played: Played, *except_for: str) -> None:
+    assert played.outcome.exits == dict.fromkeys(ALL, 0), played.outcome.messages
+    assert not played.outcome.interrupted
+    played.assert_honest(*except_for)
+
+
+def lost(peer: str) -> Any:
+    """A status that says that a peer is not heard."""
+    return lambda status: status.get("peers", {}).get(peer) is False
+
+
+# -- two short ones -----------------------------------------------------------------------------------------
+
+
+def status_of(agent: DeskAgent, until: Any) -> dict[str, Any]:
+    """The first status for which something is so, as a person's tool hears it."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", f'["{agent.stream}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config) as session:
+        statuses = session.declare_subscriber("cofix/v1/desk/r1/status")
+        for _ in range(40):
+            status: dict[str, Any] = msgpack.unpackb(statuses.recv().payload.to_bytes())
+            if until(status):
+                return status
+    pytest.fail(f"no such status; the last one: {status}")
+
+
+def test_a_second_process_of_one_robot_is_refused_and_harms_nothing() -> None:
+    with desk_agent() as agent:
+        second = subprocess.run(
+            [*COFIX, "agent", str(agent.state_dir.parent / "r1.toml")],
+            capture_output=True,
+            text=True,
+            timeout=30,
+            check=False,
+        )
+        assert second.returncode == 2, second.stderr
+        (line,) = second.stderr.strip().splitlines()
+        assert "is in use: an agent runs with it already; stop that one" in line
+        assert agent.socket.exists()
+        assert status_of(agent, lambda status: status.get("state") == "running")["troubles"] == {}
+        agent.stop()
+
+
+@contextmanager
+def small_disk(folder: Path, size: str) -> Iterator[None]:
+    """A file system of a few kilobytes on a folder."""
+    done = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(folder)], check=False)
+    if done.returncode != 0:
+        pytest.skip("a file system cannot be mounted here")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounting a small file system needs root")
+def test_on_a_full_disk_it_goes_on_and_says_so() -> None:
+    with tempfile.TemporaryDirectory(prefix="cofix-") as name, small_disk(Path(name), "64k"):
+        agent = DeskAgent(Path(name))
+        try:
+            agent.wait()
+            with suppress(OSError), (Path(name) / "ballast").open("wb", buffering=0) as ballast:
+                while True:
+                    ballast.write(bytes(1024))
+            locate(agent, 15)
+            found = status_of(agent, lambda status: "state.write_failed" in status["troubles"])
+            assert found["troubles"]["state.write_failed"] == "No space left on device"
+            assert found["state"] == "running" and found["sigma_m"] > 0.0
+            (Path(name) / "ballast").unlink()
+            status_of(agent, lambda status: "state.write_failed" not in status["troubles"])
+            agent.stop()
+        finally:
+            agent.kill()
+
+
+# -- processes ----------------------------------------------------------------------------------------------
+
+
+@LONG
+def test_killed_and_started_again(tmp_path: Path) -> None:
+    fault = 'faults=[{kind = "crash", robot = "r3", at_s = 6.0, for_s = 8.0}]'
+    played = play(tmp_path, scenario(30.0, fault), 2.0)
+    assert_all_well(played)
+    for robot in ("r1", "r2", "r4"):
+        assert played.ever(robot, lost("r3")) and played.last(robot)["peers"]["r3"]
+    assert played.last("r3")["state_file"]["state.used"] == 1
+
+
+@LONG
+def test_paused_and_continued(tmp_path: Path) -> None:
+    fault = 'faults=[{kind = "pause", robot = "r2", at_s = 6.0, for_s = 6.0}]'
+    played = play(tmp_path, scenario(25.0, fault), 2.0)
+    assert_all_well(played)
+    for robot in ("r1", "r3", "r4"):
+        assert played.ever(robot, lost("r2")) and played.last(robot)["peers"]["r2"]
+        assert played.last(robot)["silence_max_s"]["r2"] > 4.0
+    assert played.last("r2")["lag_max_s"] > 4.0
+
+
+@LONG
+def test_stopped_in_good_order_and_started_again(tmp_path: Path) -> None:
+    fault = 'faults=[{kind = "restart", robot = "r4", at_s = 6.0, for_s = 6.0}]'
+    played = play(tmp_path, scenario(25.0, fault), 2.0)
+    assert_all_well(played)
+    assert played.last("r4")["state_file"]["state.used"] == 1
+    assert played.ever("r1", lost("r4")) and played.last("r1")["peers"]["r4"]
+
+
+@LONG
+def test_cut_in_two_and_healed(tmp_path: Path) -> None:
+    fault = 'faults=[{kind = "partition", groups = [["r1", "r2"], ["r3", "r4"]], at_s = 6.0, for_s = 10.0}]'
+    played = play(tmp_path, scenario(30.0, fault), 2.0)
+    assert_all_well(played)
+    for robot, away in (("r1", "r3"), ("r2", "r4"), ("r3", "r1"), ("r4", "r2")):
+        assert played.ever(robot, lost(away)) and played.last(robot)["peers"][away]
+        assert played.ever(robot, lambda status: "partition-1" in status["injected"].get("faults", []))
+        assert "faults" not in played.last(robot)["injected"]
+
+
+# -- one id twice -------------------------------------------------------------------------------------------
+
+
+class Impostor:
+    """A second process of a robot, with a folder, ports and a launcher of its own, that coasts from the survey."""
+
+    def __init__(self, folder: Path, live: Live, robot: str) -> None:
+        self._live, self._folder = live, folder
+        tables = tomllib.loads((folder / "run" / "agents" / f"{robot}.toml").read_text())
+        for key in ("mavlink", "injection", "recording"):
+            tables.pop(key, None)
+        self._state = tempfile.TemporaryDirectory(prefix="twin-", dir=folder)
+        tables["zenoh"]["listen"] = []
+        tables["state_dir"] = self._state.name
+        tables["coast"] = {"speed_mps": 1.0}
+        tables["control_socket"] = str(Path(self._state.name) / "control.sock")
+        self._control = tables["control_socket"]
+        self._path = folder / "twin.toml"
+        self._path.write_text(tomli_w.dumps(tables))
+
+    async def __aenter__(self) -> Impostor:
+        self._server = await asyncio.start_unix_server(self._serve, path=self._control)
+        self._process = await asyncio.create_subprocess_exec(*COFIX, "agent", str(self._path))
+        return self
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(json.dumps({"start": self._live.launcher.begin}).encode() + b"\n")
+        with suppress(OSError):
+            while await reader.readline():
+                pass
+
+    async def __aexit__(self, *_: Any) -> None:
+        if self._process.returncode is None:
+            self._process.send_signal(signal.SIGTERM)
+        assert await self._process.wait() == 0
+        self._server.close()
+        self._state.cleanup()
+
+
+@LONG
+def test_a_second_process_of_one_robot_elsewhere_is_named_and_not_believed(tmp_path: Path) -> None:
+    async def disturb(live: Live) -> None:
+        await live.until(5.0)
+        async with Impostor(tmp_path, live, "r3"):
+            await live.wait(lambda: all(live.status(robot)["duplicates"] == ["r3"] for robot in ("r1", "r2")))
+            await asyncio.sleep(3.0)
+        await live.wait(lambda: not any(live.status(robot)["duplicates"] for robot in ("r1", "r2")))
+
+    played = play(tmp_path, scenario(30.0), 1.0, disturb)
+    assert_all_well(played)
+    for robot in ("r1", "r2"):
+        assert played.last(robot)["rejected"]["old_life"] >= 3
+        assert "duplicate_robot: r3: two processes" in (tmp_path / "run" / "logs" / f"{robot}.log").read_text()
+
+
+# -- disks --------------------------------------------------------------------------------------------------
+
+
+@LONG
+def test_a_full_disk_while_contacts_rely_on_the_state_file(tmp_path: Path) -> None:
+    """Files of r2 can no more grow; it goes on, and after a kill begins a new life, as its peers do with it."""
+
+    async def disturb(live: Live) -> None:
+        await live.until(5.0)
+        folder = next(tmp_path.glob("cofix-*")) / "r2"
+        used = live.status("r2")["counters"]["pair.applied_initiator"]
+        resource.prlimit(live.pid("r2"), resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
+        await live.wait(lambda: {"state.write_failed", "recording.failed"} <= set(live.status("r2")["troubles"]))
+        await live.wait(lambda: live.status("r2")["counters"]["pair.applied_initiator"] >= used + 4)
+        live.notes["status"] = live.status("r2")
+        live.notes["files"] = (folder / FILE).exists(), (folder / REFUSED).exists()
+
+    fault = 'faults=[{kind = "crash", robot = "r2", at_s = 14.0, for_s = 2.0}]'
+    played = play(tmp_path, scenario(30.0, fault), 1.0, disturb)
+    assert_all_well(played)
+    assert played.notes["status"]["troubles"]["state.write_failed"] == "File too large"
+    # No start begins with a state that knows less than its peers.
+    assert played.notes["files"] == (False, True)
+    assert "state.held_back" not in played.notes["status"]["state_file"]
+    after = played.last("r2")
+    assert "state.used" not in after["state_file"] and after["troubles"] == {}
+    assert played.last("r1")["counters"]["pair.applied_responder"] > 0
+
+
+# -- sessions -----------------------------------------------------------------------------------------------
+
+
+def shut_streams(pid: int) -> int:
+    """Shut all TCP sockets of a process of ours underneath it, listening ones too; how many there were."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    process = os.pidfd_open(pid)
+    count = 0
+    try:
+        for entry in Path(f"/proc/{pid}/fd").iterdir():
+            with suppress(OSError):
+                if not os.readlink(entry).startswith("socket:"):
+                    continue
+                handle = libc.syscall(438, process, int(entry.name), 0)  # pidfd_getfd
+                if handle < 0:
+                    pytest.skip("sockets of another process cannot be reached here")
+                with socket.socket(fileno=handle) as found:
+                    if found.family == socket.AF_INET and found.type == socket.SOCK_STREAM:
+                        found.shutdown(socket.SHUT_RDWR)
+                        count += 1
+    finally:
+        os.close(process)
+    return count
+
+
+@LONG
+def test_a_lost_zenoh_session_is_opened_again(tmp_path: Path) -> None:
+    async def disturb(live: Live) -> None:
+        await live.until(5.0)
+        assert shut_streams(live.pid("r2")) >= 3
+        live.notes["after_s"] = await live.wait(lambda: live.status("r2")["transport"].get("reopened"))
+        before = {robot: live.status(robot)["pairs"].get("r2", 0) for robot in ("r1", "r3", "r4")}
+        await live.wait(
+            lambda: all(live.status(robot)["pairs"].get("r2", 0) > then + 3 * NS for robot, then in before.items())
+        )
+
+    played = play(tmp_path, scenario(35.0), 1.0, disturb)
+    assert_all_well(played)
+    found = played.last("r2")["transport"]
+    assert found["reopened"] == 1 and found["lost_deaf"] == 1
+    assert not [robot for robot in ("r1", "r3", "r4") if "reopened" in played.last(robot)["transport"]]
+    print(f"session opened again after {played.notes['after_s']:.1f} s")
+
+
+@LONG
+@pytest.mark.parametrize("how", ["radio", "process"])
+def test_who_vanishes_in_silence_stalls_nobody(tmp_path: Path, how: str) -> None:
+    """Twenty times a robot is gone without a word, data to it unacknowledged, and back."""
+    reason = missing() if how == "radio" else None
+    if reason is not None:
+        pytest.skip(reason)
+    with Lan(ALL if how == "radio" else []) as lan:
+
+        async def disturb(live: Live) -> None:
+            await live.until(4.0)
+            for _ in range(20):
+                if how == "radio":
+                    lan.vanish("r3")
+                else:
+                    os.kill(live.pid("r3"), signal.SIGSTOP)
+                try:
+                    await asyncio.sleep(4.0)
+                finally:
+                    if how == "radio":
+                        lan.appear("r3")
+                    else:
+                        os.kill(live.pid("r3"), signal.SIGCONT)
+                await asyncio.sleep(4.0)
+            live.notes["rounds"] = 20
+
+        played = play(tmp_path, scenario(170.0), 1.0, disturb, lan.hosts or None)
+    assert lan.left == []
+    assert_all_well(played)
+    assert played.notes["rounds"] == 20
+    healthy = ("r1", "r2", "r4")
+    worst = {(a, b): played.last(a)["silence_max_s"][b] for a in healthy for b in healthy if a != b}
+    assert max(worst.values()) <= SILENT_S, worst
+    assert min(played.last(robot)["silence_max_s"]["r3"] for robot in healthy) > 3.0
+    print(f"longest silence of a healthy pair in 20 rounds ({how}): {max(worst.values()):.2f} s")
