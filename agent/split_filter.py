@@ -28,6 +28,7 @@ from agent.joint_history import JointHistory, Learnt
 from agent.joint_state import CONTRADICTIONS, JointModel, Used
 from agent.joint_tracks import JointState
 from agent.pair_clock import PairClocks
+from agent.peer_tables import has_room, remember
 from agent.saved_state import SavedSplit
 from agent.settings import AgentSettings
 from agent.split_exchange import SplitExchange
@@ -207,6 +208,12 @@ class SplitFilter:
             self._exchanges[peer] = SplitExchange(self._settings.robot, timeout_ns, self._settings.lateness.horizon_ns)
         return self._exchanges[peer]
 
+    def _room(self, peer: str) -> bool:
+        """Whether there is a pair with a peer, or room for one."""
+        found = has_room(self._exchanges, peer)
+        self._counters["pair.too_many_peers"] += not found
+        return found
+
     def _told(self, then: JointState, measurements: tuple[Measurement, ...]) -> SplitSnapshot:
         """The belief as it is sent, with as many tracks as fit; its private noise is shared from now on."""
         tracks, relayed = list(then.tracks), len(then.relayed)
@@ -231,6 +238,8 @@ class SplitFilter:
     def measured(
         self, peer: str, t_ns: int, now_ns: int, measurements: tuple[Measurement, ...], effects: list[Effect]
     ) -> None:
+        if not self._room(peer):
+            return
         exchange = self._exchange(peer)
         last = self._contacts.get(peer)
         if exchange.full:
@@ -270,6 +279,8 @@ class SplitFilter:
         if not _usable(request.snapshot) or any(item.kind not in RELATIVE_ANGLES for item in request.measurements):
             self._counters["pair.malformed"] += 1
             return
+        if not self._room(peer):
+            return
         exchange, epoch = self._exchange(peer), request.epoch
         if exchange.known(epoch):
             self._counters["pair.request_repeat_reply"] += 1
@@ -292,7 +303,8 @@ class SplitFilter:
         if not isinstance(body, SplitReply):
             self._counters["pair.other_form"] += 1
             return
-        request = self._exchange(peer).replied(body.epoch)
+        exchange = self._exchanges.get(peer)
+        request = None if exchange is None else exchange.replied(body.epoch)
         if request is None:
             self._counters["pair.reply_ignore"] += 1
             return
@@ -338,9 +350,10 @@ class SplitFilter:
     def link_changed(self, event: LinkChange) -> None:
         life = (event.incarnation, event.boot_id)
         before = self._lives.get(event.peer)
-        self._lives[event.peer] = life
+        remember(self._lives, event.peer, life, self._exchanges)
         if before is not None and before != life:
-            self._exchange(event.peer).restarted()
+            if event.peer in self._exchanges:
+                self._exchanges[event.peer].restarted()
             self._counters["pair.restarts"] += 1
 
     def settled(self, until_ns: int, effects: list[Effect]) -> None:

@@ -106,7 +106,9 @@ def types_wrong(rng: Random, payload: bytes, other: bytes) -> bytes:
 def header_lied(rng: Random, payload: bytes, other: bytes) -> bytes:
     """A field of the header that is not what it should be: foreign, of another life, of another time, or repeated."""
     message: Any = msgpack.unpackb(payload, use_list=True)
-    head = message[0]
+    head = message[0] if isinstance(message, list) and message else None
+    if not isinstance(head, list) or len(head) != 7:
+        return payload
     index = rng.randrange(len(head))
     if index == 1:
         head[1] = rng.choice(("r1", "r2", "r3", "stranger", "R1", "", "r" * 25, "../r1", "r1\x00"))
@@ -152,11 +154,11 @@ def mutated(rng: Random, payload: bytes, other: bytes) -> bytes:
     return changed
 
 
-def renewed(payload: bytes, *, seq: int, t_ns: int, boot_id: int | None = None) -> bytes:
-    """A genuine message with another number and other stamps, as its robot could send it at `t_ns`."""
+def renewed(payload: bytes, *, seq: int, t_ns: int, life: tuple[int, int] | None = None) -> bytes:
+    """A genuine message with another number and other stamps, as its robot could send it at `t_ns` in a `life` (boot id, incarnation)."""
     message: Any = msgpack.unpackb(payload, use_list=True)
     head = message[0]
     head[4:7] = seq, t_ns, t_ns
-    if boot_id is not None:
-        head[2] = boot_id
+    if life is not None:
+        head[2:4] = life
     return bytes(msgpack.packb(message))
