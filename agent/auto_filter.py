@@ -29,7 +29,6 @@ from agent.joint_filter import JointFilter
 from agent.joint_room import has_room
 from agent.joint_tracks import JointState
 from agent.peer_tables import remember
-from agent.peer_tables import remember
 from agent.saved_state import SavedSplit
 from agent.settings import AgentSettings, TrackEnd
 from agent.split_filter import SplitFilter

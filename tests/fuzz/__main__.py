@@ -16,9 +16,9 @@ import tracemalloc
 from collections import Counter
 from pathlib import Path
 
+from tests.fuzz.corpus import FORMS
 from tests.fuzz.examples import play_examples
 from tests.fuzz.floods import CONTENTS, CoreFlood, EndpointFlood, largest_difference
-from tests.fuzz.corpus import FORMS
 
 CHUNK = 100_000
 EXAMPLES_CHUNK = 10_000

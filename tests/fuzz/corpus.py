@@ -25,9 +25,9 @@ KINDS = frozenset(range(1, 10))
 """Every kind of message of the wire format."""
 
 
-def fleet(form: str, duration_s: float) -> Scenario:
+def fleet(form: str, duration_s: float, clock_sigma_s: float = 0.005) -> Scenario:
     """Five robots in reach of each other and of a target, no faults, messages that take a while."""
-    more = [f"duration_s={duration_s}", f"window_s=[2, {duration_s}]", "links.delay_s=0.05", *FORMS[form]]
+    more = [f"lateness.clock_sigma_s={clock_sigma_s}", f"duration_s={duration_s}", f"window_s=[2, {duration_s}]", "links.delay_s=0.05", *FORMS[form]]
     return load("fault-plan", more).model_copy(update={"fault_plan": None})
 
 
@@ -48,7 +48,7 @@ class Listener:
 
 
 @cache
-def recorded(form: str, duration_s: float = 12.0, beginner: bool = False) -> tuple[Packet, ...]:
+def recorded(form: str, duration_s: float = 6.0, beginner: bool = False) -> tuple[Packet, ...]:
     """What reaches robots r1 to r3 in a run; with a `beginner`, r2 has to ask where it is."""
     made = fleet(form, duration_s)
     if beginner:
@@ -77,7 +77,7 @@ def _eye(robot):  # type: ignore[no-untyped-def]
 def corpus() -> tuple[Packet, ...]:
     """Messages of every kind and form."""
     packets = [packet for form in FORMS for packet in recorded(form)]
-    packets += [packet for form in ("safe", "split_joint") for packet in recorded(form, 12.0, True)]
+    packets += [packet for form in ("safe", "split_joint") for packet in recorded(form, 6.0, True)]
     assert {kind(packet) for packet in packets} == KINDS, sorted({kind(packet) for packet in packets})
     return tuple(packets)
 

@@ -155,7 +155,7 @@ def mutated(rng: Random, payload: bytes, other: bytes) -> bytes:
 
 
 def renewed(payload: bytes, *, seq: int, t_ns: int, life: tuple[int, int] | None = None) -> bytes:
-    """A genuine message with another number and other stamps, as its robot could send it at `t_ns` in a `life` (boot id, incarnation)."""
+    """A genuine message as its robot could send it at `t_ns`, in a `life` (boot id, incarnation), by another number."""
     message: Any = msgpack.unpackb(payload, use_list=True)
     head = message[0]
     head[4:7] = seq, t_ns, t_ns
