@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: run test check unit setup benchmark check-data check-long clean
+.PHONY: run test check unit setup benchmark check-data check-fuzz check-long clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("cofix needs Python 3.11 or newer: make PYTHON=python3.11") if sys.version_info < (3, 11) else None'
@@ -36,9 +36,13 @@ benchmark: setup
 	$(BIN)/python -m pip install -qq --editable '.[benchmarks]'
 	$(BIN)/python -m benchmarks
 
+# Everything a peer can send, in millions, with a table of what became of it. Goes on where it stopped.
+check-fuzz: setup
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --out runs/check-fuzz
+
 # Thousands of seeds of random faults, invariants checked after every event. Results are kept in runs/check-long, and the same
 # command goes on where it stopped.
-check-long: setup
+check-long: setup check-fuzz
 	COFIX_THOROUGH=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -P -m pytest -n 2 tests/agent tests/sim tests/network
 	COFIX_THOROUGH=1 $(BIN)/python -P -m pytest tests/deploy/test_process_fleet.py tests/docs tests/examples
 	OPENBLAS_NUM_THREADS=1 $(BIN)/cofix montecarlo fault-plan --trials 2000 --check --out runs/check-long/field

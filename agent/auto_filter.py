@@ -30,6 +30,7 @@ from agent.health import Health
 from agent.joint_filter import JointFilter
 from agent.joint_room import has_room
 from agent.joint_tracks import JointState
+from agent.peer_tables import remember
 from agent.saved_state import SavedSplit
 from agent.settings import AgentSettings, TrackEnd
 from agent.split_filter import SplitFilter
@@ -221,7 +222,7 @@ class AutoFilter:
         self._active.heard(event, effects)
 
     def link_changed(self, event: LinkChange) -> None:
-        self._lives[event.peer] = event
+        remember(self._lives, event.peer, event, self._active.contacts())
         self._active.link_changed(event)
 
     def settled(self, until_ns: int, effects: list[Effect]) -> None:

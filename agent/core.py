@@ -32,7 +32,7 @@ from network.messages import PairReply, PairRequest, SplitReply, SplitRequest, S
 Array = NDArray[np.float64]
 
 MAX_KINDS = 64
-"""Kinds of measurements that figures are kept of: kinds of fixes, landmarks, sightings and contacts."""
+"""Kinds of measurements that figures are kept of: kinds of fixes, landmarks, sightings and contacts, the last of them `other`."""
 
 
 @dataclass(slots=True)
@@ -451,6 +451,9 @@ class Agent:
     def _count_nis(self, kind: str, nis: float) -> None:
         if self._quiet:
             return
+        # A peer says which kinds it has measured at an instant: there are more mixtures than anybody wants figures of.
+        if kind not in self.nis and len(self.nis) >= MAX_KINDS - 1:
+            kind = "other"
         entry = self.nis.setdefault(kind, NisSum())
         entry.total += nis
         entry.count += 1

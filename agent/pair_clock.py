@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from agent.events import Received
+from agent.peer_tables import remember
 from agent.settings import AgentSettings
 from network.messages import Measurement
 
@@ -26,10 +27,10 @@ class PairClocks:
         prior = self._settings.lateness.clock_sigma_ns
         sigma = event.offset_sigma_ns
         if prior == 0 or sigma is None:
-            self._sigma_ns[event.message.header.source] = prior
+            remember(self._sigma_ns, event.message.header.source, prior)
             return 0
         share = prior**2 / (prior**2 + sigma**2)
-        self._sigma_ns[event.message.header.source] = round(share**0.5 * sigma)
+        remember(self._sigma_ns, event.message.header.source, round(share**0.5 * sigma))
         return round(share * event.offset_ns)
 
     def widened(self, peer: str, item: Measurement) -> Measurement:

@@ -19,6 +19,7 @@ from agent.health import Health
 from agent.history import History
 from agent.pair_clock import PairClocks
 from agent.pairing import PairExchange, Step
+from agent.peer_tables import has_room, remember
 from agent.saved_state import SavedFactors
 from agent.settings import AgentSettings
 from network.messages import MAX_MEASUREMENTS, Epoch, Measurement, PairReply, PairRequest, ReplyStatus, StartRequest
@@ -35,7 +36,7 @@ REFUSALS = {
 
 
 class Pairs:
-    """The pair protocol with every peer met, bounded in number by the endpoint."""
+    """The pair protocol with the peers met first; beyond `MAX_PEERS` there is no room for another pair."""
 
     def __init__(
         self,
@@ -63,6 +64,12 @@ class Pairs:
                 self._settings.lateness.horizon_ns,
             )
         return self._exchanges[peer]
+
+    def _room(self, peer: str) -> bool:
+        """Whether there is a pair with a peer, or room for one."""
+        found = has_room(self._exchanges, peer)
+        self._counters["pair.too_many_peers"] += not found
+        return found
 
     def saved(self, state: RobotState) -> SavedFactors:
         """The newest state with what the next life of this robot must remember."""
@@ -103,6 +110,8 @@ class Pairs:
         history: History,
     ) -> tuple[RobotState, PairRequest | None]:
         """A peer was measured at `t_ns`; returns the state and the request to send, if a contact is opened."""
+        if not self._room(peer):
+            return state, None
         exchange = self.exchange(peer)
         step = exchange.measured(t_ns, state.pair(peer).base)
         if step is not Step.OPEN:
@@ -136,6 +145,8 @@ class Pairs:
         epoch = request.epoch
         if epoch.initiator != peer or not self._model.usable(request.snapshot) or not _known_kinds(request):
             self._counters["pair.malformed"] += 1
+            return state
+        if not self._room(peer):
             return state
         exchange = self.exchange(peer)
         step = exchange.requested(request, state.pair(peer).base)
@@ -188,6 +199,10 @@ class Pairs:
 
     def reply(self, peer: str, reply: PairReply, state: RobotState, history: History) -> RobotState:
         """The peer answered a contact."""
+        if peer not in self._exchanges:
+            # Nobody has asked, neither now nor in an earlier life.
+            self._counters["pair.reply_ignore"] += 1
+            return state
         step, pending = self.exchange(peer).replied(reply, state.pair(peer).base)
         if pending is not None:
             self._health.answered(peer, reply.status is ReplyStatus.INCONSISTENT)
@@ -222,14 +237,17 @@ class Pairs:
         """
         life = (event.incarnation, event.boot_id)
         before = self._lives.get(event.peer)
-        self._lives[event.peer] = life
+        remember(self._lives, event.peer, life, self._exchanges)
         if before is None or before == life:
             return state
+        exchange = self._exchanges.get(event.peer)
         if before[0] == event.incarnation:
             self._counters["pair.resumed"] += 1
-            self.exchange(event.peer).resumed()
+            if exchange is not None:
+                exchange.resumed()
             return state
-        self.exchange(event.peer).restarted()
+        if exchange is not None:
+            exchange.restarted()
         if not state.pair(event.peer).base.met and not state.pair(event.peer).lines:
             return state
         state = self._restarted_pair(event.peer, event.t_ns, state)

@@ -31,6 +31,7 @@ from agent.joint_layout import Met
 from agent.joint_state import CONTRADICTIONS, JointModel, Used
 from agent.joint_tracks import JointState
 from agent.pair_clock import PairClocks
+from agent.peer_tables import has_room, remember
 from agent.saved_state import SavedSplit
 from agent.settings import AgentSettings
 from agent.split_exchange import SplitExchange
@@ -219,6 +220,12 @@ class SplitFilter:
             self._exchanges[peer] = SplitExchange(self._settings.robot, timeout_ns, self._settings.lateness.horizon_ns)
         return self._exchanges[peer]
 
+    def _room(self, peer: str) -> bool:
+        """Whether there is a pair with a peer, or room for one."""
+        found = has_room(self._exchanges, peer)
+        self._counters["pair.too_many_peers"] += not found
+        return found
+
     def _told(self, then: JointState, measurements: tuple[Measurement, ...]) -> SplitSnapshot:
         """The belief as it is sent, with as many tracks as fit; its private noise is shared from now on."""
         tracks, relayed = list(then.tracks), len(then.relayed)
@@ -243,6 +250,8 @@ class SplitFilter:
     def measured(
         self, peer: str, t_ns: int, now_ns: int, measurements: tuple[Measurement, ...], effects: list[Effect]
     ) -> None:
+        if not self._room(peer):
+            return
         exchange = self._exchange(peer)
         last = self._contacts.get(peer)
         if exchange.full:
@@ -282,6 +291,8 @@ class SplitFilter:
         if not _usable(request.snapshot) or any(item.kind not in RELATIVE_ANGLES for item in request.measurements):
             self._counters["pair.malformed"] += 1
             return
+        if not self._room(peer):
+            return
         exchange, epoch = self._exchange(peer), request.epoch
         if exchange.known(epoch) and not self._settings.unsafe.accept_duplicates:
             self._counters["pair.request_repeat_reply"] += 1
@@ -304,7 +315,8 @@ class SplitFilter:
         if not isinstance(body, SplitReply):
             self._counters["pair.other_form"] += 1
             return
-        request = self._exchange(peer).replied(body.epoch)
+        exchange = self._exchanges.get(peer)
+        request = None if exchange is None else exchange.replied(body.epoch)
         if request is None:
             self._counters["pair.reply_ignore"] += 1
             return
@@ -359,9 +371,10 @@ class SplitFilter:
     def link_changed(self, event: LinkChange) -> None:
         life = (event.incarnation, event.boot_id)
         before = self._lives.get(event.peer)
-        self._lives[event.peer] = life
+        remember(self._lives, event.peer, life, self._exchanges)
         if before is not None and before != life:
-            self._exchange(event.peer).restarted()
+            if event.peer in self._exchanges:
+                self._exchanges[event.peer].restarted()
             self._counters["pair.restarts"] += 1
 
     def settled(self, until_ns: int, effects: list[Effect]) -> None:

@@ -40,12 +40,15 @@ from network.messages import (
     SplitRequest,
     StartRequest,
 )
-from network.peers import Peer, PeerTable
+from network.peers import MAX_PEERS, Peer, PeerTable
 from network.wire import OversizeError, decode, encode
 from network.wire_fields import MAX_INT, WireError, valid_id
 
 REPEATED = ("duplicate", "too_old_seq")
 """Why a message of a living robot is refused that has been taken before, or may have been."""
+
+MAX_DESTINATIONS = 2 * MAX_PEERS
+"""Channels and robots whose numbers are kept apart."""
 
 MIN_MAX_BYTES = 900
 """A hello with all its echoes must fit."""
@@ -167,6 +170,8 @@ class Endpoint:
         self.counters: Counter[str] = Counter()
         self._table = PeerTable(settings.silent_after_ns, settings.horizon_ns + settings.silent_after_ns)
         self._next_seq: dict[tuple[str, str | None], int] = {}
+        # Where numbers begin: beyond those to robots that have been forgotten here.
+        self._first_seq = 0
         self._hello_due_ns: int | None = None
         self._echo_turn = 0
         self._clock_changes: list[ClockChange] = []
@@ -193,14 +198,22 @@ class Endpoint:
     def _packet(self, now_ns: int, channel: str, peer: str | None, t_meas_ns: int, body: Body) -> Packet:
         if not _belongs(body, channel):
             raise ValueError(f"{type(body).__name__} does not belong on channel {channel}")
-        seq = self._next_seq.get((channel, peer), 0)
+        seq = self._next_seq.get((channel, peer), self._first_seq)
         payload = encode(self._header(seq, t_meas_ns, now_ns), body)
         if len(payload) > self.settings.max_bytes:
             raise OversizeError(f"message takes {len(payload)} of max_bytes = {self.settings.max_bytes}")
-        self._next_seq[(channel, peer)] = seq + 1
+        self._count_from(channel, peer, seq + 1)
         self.counters["sent"] += 1
         self.counters["sent_bytes"] += len(payload)
         return Packet(self.robot, channel, peer, payload)
+
+    def _count_from(self, channel: str, peer: str | None, seq: int) -> None:
+        """Remember the next number to a destination; whoever was written to longest ago is forgotten beyond the bound."""
+        self._next_seq.pop((channel, peer), None)
+        self._next_seq[channel, peer] = seq
+        if len(self._next_seq) > MAX_DESTINATIONS:
+            oldest = next(where for where in self._next_seq if where[1] is not None)
+            self._first_seq = max(self._first_seq, self._next_seq.pop(oldest))
 
     def tick(self, now_ns: int) -> tuple[list[Packet], list[PeerChange]]:
         """The hello if it is due, and the peers that fell silent, by id."""

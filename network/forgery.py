@@ -83,7 +83,7 @@ class Forger:
             return genuine
         payload = genuine.payload
         if self.forgery.content == "hostile":
-            payload = _hostile(payload, words)
+            payload = hostile(payload, words)
         else:
             parcel = Parcel(genuine.source, self._receiver, genuine.channel, 0, words[1] >> 1, t_ns)
             payload = corrupted(payload, self._seed, parcel)
@@ -95,7 +95,7 @@ class Forger:
         return a, b, c, d
 
 
-def _hostile(payload: bytes, words: tuple[int, int, int, int]) -> bytes:
+def hostile(payload: bytes, words: tuple[int, int, int, int]) -> bytes:
     """One value of a message, at any depth, replaced by an extreme one."""
     try:
         message: Any = msgpack.unpackb(payload, use_list=True)

@@ -25,7 +25,7 @@ from network.messages import Epoch, Packet
 from network.wire import peek_header
 from sim.agents import agent_config, autopilot_fix
 from sim.bound import BoundRunner
-from sim.engine_faults import ClockChange, EngineFaults, Forged, Happening, Pause, Resume, Start, Stop
+from sim.engine_faults import ClockChange, EngineFaults, Forged, Happening, Intruder, Pause, Resume, Start, Stop
 from sim.fault_plan import trial_faults
 from sim.faulty_world import FaultyWorld
 from sim.invariants import InvariantChecker
@@ -171,6 +171,11 @@ class VirtualEngine:
         self._faults.add(name, fault)
         for t_ns, robot, what in self._faults.happenings(name, self._processes):
             self._push(max(t_ns, self._now), FAULT, robot, what)
+
+    def intrude(self, robot: str, intruder: Intruder) -> None:
+        """Have somebody on the air beside a robot, who hears what is sent to it and sends it packets."""
+        for t_ns, receiver, what in self._faults.intruded(robot, intruder):
+            self._push(max(t_ns, self._now), FAULT, receiver, what)
 
     def end_fault(self, name: str) -> bool:
         """End a fault of links or sensors now; False if there is none of that name that goes on."""

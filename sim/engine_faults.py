@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 from agent.clock_faults import FaultyClock
 from agent.fault_parts import (
@@ -55,11 +56,21 @@ class ClockChange:
     """The clock steps or changes its rate: timers are due at other instants."""
 
 
+class Intruder(Protocol):
+    """Somebody on the air beside one receiver: hears what is sent to it, and sends it packets; see `Forger`."""
+
+    def seen(self, packet: Packet) -> None: ...
+
+    def next_ns(self, after_ns: int) -> int | None: ...
+
+    def packet(self, t_ns: int) -> Packet | None: ...
+
+
 @dataclass(frozen=True, slots=True)
 class Forged:
     """A forged packet arrives."""
 
-    forger: Forger
+    forger: Intruder
 
 
 Happening = Stop | Start | Pause | Resume | ClockChange | Forged
@@ -73,7 +84,7 @@ class EngineFaults:
         self._faults: dict[str, AnyFaultPart] = {}
         self.links = LinkFaults(seed)
         self._clocks: dict[str, FaultyClock] = {}
-        self._forgers: dict[str, list[Forger]] = {}
+        self._forgers: dict[str, list[Intruder]] = {}
 
     def add(self, name: str, fault: AnyFaultPart) -> None:
         """One more fault. Raises `ValueError` if the name is in use."""
@@ -121,11 +132,14 @@ class EngineFaults:
                 forgery = fault.forgery(name)
                 for robot in robots:
                     if forgery.reaches(robot):
-                        forger = Forger(forgery, self._seed, robot)
-                        self._forgers.setdefault(robot, []).append(forger)
-                        first = forger.next_ns(-1)
-                        if first is not None:
-                            yield first, robot, Forged(forger)
+                        yield from self.intruded(robot, Forger(forgery, self._seed, robot))
+
+    def intruded(self, robot: str, intruder: Intruder) -> Iterator[tuple[int, str, Happening]]:
+        """Somebody on the air beside `robot`, and the first packet it sends, as in `happenings`."""
+        self._forgers.setdefault(robot, []).append(intruder)
+        first = intruder.next_ns(-1)
+        if first is not None:
+            yield first, robot, Forged(intruder)
 
     def overheard(self, receiver: str, packet: Packet) -> None:
         """A genuine packet on its way to a receiver, for those who forge others after it."""

@@ -11,7 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from network.endpoint import ClockChange, Delivery, Endpoint, EndpointSettings, PeerChange, PeerDoubled
+from network.endpoint import (
+    MAX_DESTINATIONS,
+    ClockChange,
+    Delivery,
+    Endpoint,
+    EndpointSettings,
+    PeerChange,
+    PeerDoubled,
+)
 from network.messages import (
     MAX_ECHOES,
     MAX_MESSAGE_BYTES,
@@ -29,7 +37,7 @@ from network.messages import (
     TargetBelief,
 )
 from network.peers import MAX_PEERS
-from network.wire import OversizeError, decode, encode
+from network.wire import OversizeError, decode, encode, peek_header
 
 MS = 10**6
 S = 10**9
@@ -530,3 +538,19 @@ def test_a_perfect_pipe_delivers_everything() -> None:
         now_ns = T0 + k * MS
         got += [counter_of(d) for d in deliveries(b.receive(now_ns, a.send(now_ns, "r2", now_ns, reply(k))))]
     assert got == list(range(3_000))
+
+
+def test_ever_new_destinations_are_forgotten_and_their_numbers_never_used_again() -> None:
+    """A robot that is written to again must not take the message for a repetition."""
+    sender, receiver = endpoint("r1"), endpoint("r2")
+    refused = PairReply(Epoch(T0, "r2", 1), ReplyStatus.BUSY)
+    for _ in range(3):
+        assert len(receiver.receive(T0, sender.send(T0, "r2", T0, refused))) >= 1
+    for index in range(3 * MAX_DESTINATIONS):
+        sender.send(T0, f"x-{index}", T0, refused)
+        sender.tick(T0 + index)
+    assert len(sender._next_seq) == MAX_DESTINATIONS
+    receiver.receive(T0, sender.send(T0, "r2", T0, refused))
+    assert receiver.counters["delivered"] == 4
+    header = peek_header(sender.tick(T0 + 10 * S)[0][0].payload)
+    assert header is not None and header.seq > 0, "the channel to everybody is not forgotten"

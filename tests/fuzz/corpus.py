@@ -1,0 +1,86 @@
+"""Genuine messages of every kind, overheard in virtual runs of each form."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import msgpack
+
+from network.messages import Packet
+from sim.engine import VirtualEngine
+from sim.scenario import Scenario
+from sim.scenario_file import load
+from sim.trial import open_world
+
+FORMS = {
+    "safe": ["localization.form=safe"],
+    "published": ["localization.form=published"],
+    "joint": ["localization.form=joint"],
+    "split_joint": ["localization.form=split_joint"],
+    "replica": ["localization.kind=replica"],
+}
+"""`--set` overrides by form."""
+
+KINDS = frozenset(range(1, 10))
+"""Every kind of message of the wire format."""
+
+
+def fleet(form: str, duration_s: float, clock_sigma_s: float = 0.005) -> Scenario:
+    """Five robots in reach of each other and of a target, no faults, messages that take a while."""
+    more = [f"lateness.clock_sigma_s={clock_sigma_s}", f"duration_s={duration_s}", f"window_s=[2, {duration_s}]", "links.delay_s=0.05", *FORMS[form]]
+    return load("fault-plan", more).model_copy(update={"fault_plan": None})
+
+
+class Listener:
+    """Somebody beside a robot who only listens."""
+
+    def __init__(self) -> None:
+        self.heard: list[Packet] = []
+
+    def seen(self, packet: Packet) -> None:
+        self.heard.append(packet)
+
+    def next_ns(self, after_ns: int) -> int | None:
+        return None
+
+    def packet(self, t_ns: int) -> Packet | None:
+        return None
+
+
+@cache
+def recorded(form: str, duration_s: float = 6.0, beginner: bool = False) -> tuple[Packet, ...]:
+    """What reaches robots r1 to r3 in a run; with a `beginner`, r2 has to ask where it is."""
+    made = fleet(form, duration_s)
+    if beginner:
+        robots = [
+            robot.model_copy(update={"start_source": "peer", "sensors": robot.sensors | {"eye": _eye(robot)}})
+            if robot.id == "r2"
+            else robot
+            for robot in made.robots
+        ]
+        made = made.model_copy(update={"robots": robots})
+    engine = VirtualEngine(made, open_world(made, 1), 1)
+    listener = Listener()
+    for robot in ("r1", "r2", "r3"):
+        engine.intrude(robot, listener)
+    engine.run()
+    # A broadcast is overheard by each of them.
+    return tuple(dict.fromkeys(listener.heard))
+
+
+def _eye(robot):  # type: ignore[no-untyped-def]
+    """A camera that sees peers, as that of targets."""
+    return robot.sensors["camera"].model_copy(update={"of": ["peers"]})
+
+
+@cache
+def corpus() -> tuple[Packet, ...]:
+    """Messages of every kind and form."""
+    packets = [packet for form in FORMS for packet in recorded(form)]
+    packets += [packet for form in ("safe", "split_joint") for packet in recorded(form, 6.0, True)]
+    assert {kind(packet) for packet in packets} == KINDS, sorted({kind(packet) for packet in packets})
+    return tuple(packets)
+
+
+def kind(packet: Packet) -> int:
+    return int(msgpack.unpackb(packet.payload)[1])
