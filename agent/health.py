@@ -25,6 +25,7 @@ from dataclasses import dataclass, field
 
 from agent.effects import Alarm
 from agent.settings import HealthSettings
+from network.peers import MAX_PEERS
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +54,7 @@ class _Record:
 
 
 class Health:
-    """Verdicts on all peers of one robot, by their ids; their number is bounded by the endpoint."""
+    """Verdicts on all peers of one robot, by their ids: of `MAX_PEERS` at most, quarantined ones are forgotten last."""
 
     def __init__(
         self, settings: HealthSettings, counters: Counter[str], saved: dict[str, SavedVerdict] | None = None
@@ -71,6 +72,9 @@ class Health:
     def _record(self, peer: str) -> _Record:
         if peer not in self._records:
             settings = self._settings
+            if len(self._records) >= MAX_PEERS:
+                trusted = (name for name, record in self._records.items() if not record.quarantined)
+                del self._records[next(trusted, next(iter(self._records)))]
             self._records[peer] = _Record(deque(maxlen=settings.window), deque(maxlen=settings.readmit_after))
         return self._records[peer]
 

@@ -9,6 +9,7 @@ import numpy as np
 from agent.effects import Alarm
 from agent.health import Health
 from agent.settings import HealthSettings
+from network.peers import MAX_PEERS
 
 NS = 1_000_000_000
 
@@ -116,3 +117,15 @@ def test_switched_off_it_judges_nobody() -> None:
     judge, counters = health(enabled=False)
     assert all(told(judge, "r2", [1e6] * 50))
     assert not counters and judge.alarms() == []
+
+
+def test_ever_new_peers_fill_no_table_and_free_nobody_who_is_quarantined() -> None:
+    health = Health(HealthSettings(), Counter())
+    for k in range(8):
+        health.usable("liar", k * NS, 30.0, own_observed=True)
+    for k in range(3 * MAX_PEERS):
+        health.usable(f"r{k}", k * NS, 1.0, own_observed=True)
+    assert len(health.saved()) == MAX_PEERS and health.saved()["liar"].quarantined
+    for k in range(3 * MAX_PEERS * 8):
+        health.usable(f"bad{k // 8}", k * NS, 30.0, own_observed=True)
+    assert len(health.saved()) == MAX_PEERS
