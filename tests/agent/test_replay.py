@@ -336,3 +336,25 @@ def test_odometry_from_before_a_contact_is_counted_and_not_used(form: str) -> No
     two.own_event(odometry(5), 1200 * MS)
     assert two.own.counters["late.odometry_unused"] == 1
     assert two.own.filter.revision is before
+
+
+def test_of_late_odometry_only_what_lies_within_the_horizon_is_driven_again() -> None:
+    """What was coasted over before it stays coasted over."""
+    rng = np.random.default_rng(7)
+    lost = Odometry(0, 500 * MS, 1100 * MS, np.array([0.3, 0.0, 0.0, 0.1]), np.diag([4e-4, 1e-4, 0.0, 4e-4]))
+    cuts = [measured(t_ms * MS, "heading", "compass", rng) for t_ms in (700, 850)]
+    others: list[Event] = [odometry(k) for k in range(19) if k not in range(5, 11)]
+    timely, coasted, late = (agent("safe", horizon_ns=NS) for _ in range(3))
+    for event in sorted([*others, *cuts], key=rank):
+        for subject in (coasted, late):
+            subject.handle(replace(event, t_ns=rank(event)[0]))
+    for event in sorted([*others, *cuts, lost], key=rank):
+        timely.handle(replace(event, t_ns=rank(event)[0]))
+    late.handle(replace(lost, t_ns=1910 * MS))
+    assert late.counters["late.odometry_replayed"] == 1
+    history = late.filter.history  # type: ignore[attr-defined]
+    oldest = history.cut(history.oldest_ns)
+    assert oldest is not None and oldest.t_ns == history.oldest_ns
+    best, found, worst = (subject.filter.state.cov for subject in (timely, late, coasted))  # type: ignore[attr-defined]
+    assert np.linalg.eigvalsh(found - best).min() > -1e-6
+    assert np.trace(best) < np.trace(found) < np.trace(worst)
