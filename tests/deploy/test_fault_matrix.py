@@ -243,7 +243,7 @@ def test_a_full_disk_while_contacts_rely_on_the_state_file(tmp_path: Path) -> No
     assert "state.held_back" not in played.notes["status"]["state_file"]
     after = played.last("r2")
     assert "state.used" not in after["state_file"] and after["troubles"] == {}
-    assert played.last("r1")["counters"]["pair.applied_responder"] > 0
+    assert played.last("r2")["counters"]["pair.applied_initiator"] > 0
 
 
 # -- sessions -----------------------------------------------------------------------------------------------
