@@ -112,6 +112,7 @@ def test_on_a_full_disk_it_goes_on_and_says_so() -> None:
             assert found["troubles"]["state.write_failed"] == "No space left on device"
             assert found["state"] == "running" and found["sigma_m"] > 0.0
             (Path(name) / "ballast").unlink()
+            locate(agent, 3)
             status_of(agent, lambda status: "state.write_failed" not in status["troubles"])
             agent.stop()
         finally:
@@ -208,7 +209,6 @@ def test_a_second_process_of_one_robot_elsewhere_is_named_and_not_believed(tmp_p
         async with Impostor(tmp_path, live, "r3"):
             await live.wait(lambda: all(live.status(robot)["duplicates"] == ["r3"] for robot in ("r1", "r2")))
             await asyncio.sleep(3.0)
-        await live.wait(lambda: not any(live.status(robot)["duplicates"] for robot in ("r1", "r2")))
 
     played = play(tmp_path, scenario(30.0), 1.0, disturb)
     assert_all_well(played)
