@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: run test check unit setup benchmark check-data check-fuzz check-long clean
+.PHONY: run test check unit setup benchmark check-data check-fuzz check-long check-matrix clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("cofix needs Python 3.11 or newer: make PYTHON=python3.11") if sys.version_info < (3, 11) else None'
@@ -42,11 +42,16 @@ check-fuzz: setup
 
 # Thousands of seeds of random faults, invariants checked after every event. Results are kept in runs/check-long, and the same
 # command goes on where it stopped.
-check-long: setup check-fuzz
+check-long: setup check-fuzz check-matrix
 	COFIX_THOROUGH=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -P -m pytest -n 2 tests/agent tests/sim tests/network
 	COFIX_THOROUGH=1 $(BIN)/python -P -m pytest tests/deploy/test_process_fleet.py tests/docs tests/examples
 	OPENBLAS_NUM_THREADS=1 $(BIN)/cofix montecarlo fault-plan --trials 2000 --check --out runs/check-long/field
 	OPENBLAS_NUM_THREADS=1 $(BIN)/cofix montecarlo fault-plan --trials 500 --check --set fault_plan.intensity=storm --out runs/check-long/storm
+
+# Faults of real processes one by one (killed, paused, cut off, twice there, disks full, sessions lost), and agents in network
+# namespaces, where root and `ip` are; a quarter of an hour. -s: durations of reconnections are told.
+check-matrix: setup
+	COFIX_MATRIX=1 $(BIN)/python -P -m pytest -s --durations=0 tests/deploy/test_fault_matrix.py tests/deploy/test_namespaces.py
 
 # make check-data UTIAS7=FOLDER [TIERS=FOLDER]: the tests on recorded data, which is not part of the repository.
 check-data: setup

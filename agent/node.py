@@ -153,7 +153,7 @@ class Node:
             self.counters["send.degenerate"] += 1
 
 
-DOUBLED = "two processes send under this id; neither is believed until one of them is stopped"
+DOUBLED = "two processes send under this id; stop one of them (the earlier one, to stay, needs an empty state_dir)"
 CLOCK_REASONS = {
     "steps": "it is set again and again",
     "offset": "it is off by far more than lateness.clock_sigma_s allows; set the clock, or enlarge that",

@@ -112,6 +112,7 @@ def test_on_a_full_disk_it_goes_on_and_says_so() -> None:
             assert found["troubles"]["state.write_failed"] == "No space left on device"
             assert found["state"] == "running" and found["sigma_m"] > 0.0
             (Path(name) / "ballast").unlink()
+            locate(agent, 3)
             status_of(agent, lambda status: "state.write_failed" not in status["troubles"])
             agent.stop()
         finally:
@@ -208,7 +209,6 @@ def test_a_second_process_of_one_robot_elsewhere_is_named_and_not_believed(tmp_p
         async with Impostor(tmp_path, live, "r3"):
             await live.wait(lambda: all(live.status(robot)["duplicates"] == ["r3"] for robot in ("r1", "r2")))
             await asyncio.sleep(3.0)
-        await live.wait(lambda: not any(live.status(robot)["duplicates"] for robot in ("r1", "r2")))
 
     played = play(tmp_path, scenario(30.0), 1.0, disturb)
     assert_all_well(played)
@@ -243,7 +243,7 @@ def test_a_full_disk_while_contacts_rely_on_the_state_file(tmp_path: Path) -> No
     assert "state.held_back" not in played.notes["status"]["state_file"]
     after = played.last("r2")
     assert "state.used" not in after["state_file"] and after["troubles"] == {}
-    assert played.last("r1")["counters"]["pair.applied_responder"] > 0
+    assert played.last("r2")["counters"]["pair.applied_initiator"] > 0
 
 
 # -- sessions -----------------------------------------------------------------------------------------------
