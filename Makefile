@@ -45,6 +45,7 @@ check-fuzz: setup
 check-long: setup check-fuzz check-matrix
 	COFIX_THOROUGH=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -P -m pytest -n 2 tests/agent tests/sim tests/network
 	COFIX_THOROUGH=1 $(BIN)/python -P -m pytest tests/deploy/test_process_fleet.py tests/docs tests/examples
+	COFIX_INTERLEAVING_DEPTH=4 $(BIN)/python -P -m pytest -s tests/agent/test_three_robots.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/cofix montecarlo fault-plan --trials 2000 --check --out runs/check-long/field
 	OPENBLAS_NUM_THREADS=1 $(BIN)/cofix montecarlo fault-plan --trials 500 --check --set fault_plan.intensity=storm --out runs/check-long/storm
 

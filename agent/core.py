@@ -32,7 +32,7 @@ from network.messages import PairReply, PairRequest, SplitReply, SplitRequest, S
 Array = NDArray[np.float64]
 
 MAX_KINDS = 64
-"""Kinds of measurements that figures are kept of: kinds of fixes, landmarks, sightings and contacts, the last of them `other`."""
+"""Kinds of measurements that figures are kept of: fixes, landmarks, sightings and contacts, the last one `other`."""
 
 
 @dataclass(slots=True)

@@ -208,7 +208,7 @@ class Endpoint:
         return Packet(self.robot, channel, peer, payload)
 
     def _count_from(self, channel: str, peer: str | None, seq: int) -> None:
-        """Remember the next number to a destination; whoever was written to longest ago is forgotten beyond the bound."""
+        """Remember the next number to a destination; beyond the bound the robot written to longest ago is forgotten."""
         self._next_seq.pop((channel, peer), None)
         self._next_seq[channel, peer] = seq
         if len(self._next_seq) > MAX_DESTINATIONS:

@@ -91,10 +91,10 @@ def endpoint_parts(results: Results, seed: int, count: int) -> None:
 
 def core_parts(results: Results, seed: int, count: int) -> None:
     each = -(-count // (len(FORMS) * len(CONTENTS)))
-    for form in FORMS:
+    for form in FORMS if each else ():
         still = None
         for content in CONTENTS:
-            name = f"core/{seed}/{form}/{content}"
+            name = f"core/{seed}/{form}/{content}/{each}"
             if name in results.parts:
                 continue
             started = time.perf_counter()

@@ -27,7 +27,8 @@ KINDS = frozenset(range(1, 10))
 
 def fleet(form: str, duration_s: float, clock_sigma_s: float = 0.005) -> Scenario:
     """Five robots in reach of each other and of a target, no faults, messages that take a while."""
-    more = [f"lateness.clock_sigma_s={clock_sigma_s}", f"duration_s={duration_s}", f"window_s=[2, {duration_s}]", "links.delay_s=0.05", *FORMS[form]]
+    more = [f"lateness.clock_sigma_s={clock_sigma_s}", *FORMS[form]]
+    more += [f"duration_s={duration_s}", f"window_s=[2, {duration_s}]", "links.delay_s=0.05"]
     return load("fault-plan", more).model_copy(update={"fault_plan": None})
 
 

@@ -133,9 +133,9 @@ def assert_books_close(endpoint: Endpoint) -> None:
 class Flood:
     """An intruder beside one robot, who sends it a packet every `period_ns` from `begin_ns` on.
 
-    refused    what a robot can tell is nothing for it, whatever it knows: what the wire refuses, what is meant for others
-               or comes by the wrong channel, repetitions of a second ago, stamps of other times, earlier lives; also
-               under the header of a robot it knows
+    refused    what a robot can tell is nothing for it, whatever it knows: what the wire refuses, what is meant for
+               others or comes by the wrong channel, repetitions of a second ago, stamps of other times, earlier lives;
+               also under the header of a robot it knows
     strangers  hellos of ever new robots, and what is refused of them
     lies       the `compromised` robot's own valid header over a body that is changed, or another robot's
     """
@@ -183,7 +183,8 @@ class Flood:
             case 0:
                 return Packet(genuine.source, Channel.PAIR, "r9", mutated(rng, genuine.payload, other.payload))
             case 1:
-                channel, to = rng.choice(((Channel.BELIEF, self._receiver), (Channel.PAIR, None), (Channel.STATUS, None)))
+                wrong = (Channel.BELIEF, self._receiver), (Channel.PAIR, None), (Channel.STATUS, None)
+                channel, to = rng.choice(wrong)
                 return Packet(genuine.source, channel, to, genuine.payload)
             case 2:
                 return Packet(self._receiver, genuine.channel, genuine.destination, genuine.payload)
@@ -230,7 +231,8 @@ class Flood:
         if rng.random() < 0.0005:
             # It says that it was started again, and goes on in that life.
             self._boot_id = rng.getrandbits(60)
-        message[0] = [1, name, self._boot_id or life.boot_id, life.incarnation, self._number(), t_ns - rng.randrange(10**8), t_ns]
+        boot_id, t_meas_ns = self._boot_id or life.boot_id, t_ns - rng.randrange(10**8)
+        message[0] = [1, name, boot_id, life.incarnation, self._number(), t_meas_ns, t_ns]
         payload = packed(message, genuine.payload)
         if rng.random() < 0.7:
             payload = _body_changed(rng, payload, other.payload)
