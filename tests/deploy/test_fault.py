@@ -178,9 +178,9 @@ def test_names_differ_and_a_clock_that_was_set_stays() -> None:
 SCENARIO = """
 version = 1
 name = "trio"
-duration_s = 48.0
+duration_s = 54.0
 step_s = 0.5
-window_s = [5.0, 48.0]
+window_s = [5.0, 54.0]
 
 [localization]
 pair_interval_s = 1.0
@@ -219,7 +219,7 @@ def test_a_run_that_goes_on_is_broken_and_healed_by_hand(tmp_path: Path) -> None
         return done.stdout.partition(":")[0]
 
     run = subprocess.Popen(
-        [*COFIX, "run", "trio.toml", "--runtime", "processes", "--speed", "4", "--seed", "3", "--json", "--out", "run"],
+        [*COFIX, "run", "trio.toml", "--runtime", "processes", "--speed", "3", "--seed", "3", "--json", "--out", "run"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
