@@ -29,6 +29,7 @@ from agent.effects import Estimate
 from agent.estimation.gaussian import is_positive_definite
 from agent.factor_filter import FactorFilter
 from agent.node import Node, Outgoing
+from agent.replica_filter import ReplicaFilter
 from agent.split_filter import SplitFilter
 from network.endpoint import MAX_DESTINATIONS
 from network.messages import Epoch
@@ -182,6 +183,9 @@ def _contacts(life: _Life) -> Iterable[tuple[str, str]]:
     if isinstance(active, AutoFilter):
         active = active.active
     newest = active.contacts()
+    if isinstance(active, ReplicaFilter):
+        # It is told raw data, also late ones, and keeps each once; nothing is a contact.
+        return
     if isinstance(active, FactorFilter):
         for peer, epoch in newest.items():
             before = life.contacts.get(peer)

@@ -172,8 +172,10 @@ def test_a_bag_is_a_world_and_its_pairs_are_calibrated(bag: Path) -> None:
         ranges = [own["pair_range"] for own in result.nis.values()]
         nis[label] = sum(total for total, _ in ranges) / sum(count for _, count in ranges)
         assert all("used.pose" in own for own in result.counters.values())
-        assert sum(own.get("pair.applied_initiator", 0) for own in result.counters.values()) > 10
-    assert nis["known"] < 2.0 < 5.0 < nis["plain"]
+        # Contacts of uncalibrated pairs are hardly used: their innovations tell that something is wrong.
+        applied = sum(own.get("pair.applied_initiator", 0) for own in result.counters.values())
+        assert applied > 10 if label == "known" else applied < 10
+    assert nis["known"] < 1.0 < 3.0 < nis["plain"]
 
 
 def test_noise_of_made_odometry_and_fixes_is_drawn_from_the_seed(bag: Path) -> None:
