@@ -69,6 +69,7 @@ class _Life:
     sent: dict[tuple[str, str | None], int] = field(default_factory=dict)
     contacts: dict[str, Epoch] = field(default_factory=dict)
     used: set[tuple[str, Epoch]] = field(default_factory=set)
+    peers: dict[str, tuple[int, int]] = field(default_factory=dict)
     counted: dict[str, int] = field(default_factory=dict)
     learnt: int = 0
     volume: float = 0.0
@@ -191,9 +192,18 @@ def _contacts(life: _Life) -> Iterable[tuple[str, str]]:
             before = life.contacts.get(peer)
             if before is not None and epoch.met and epoch < before:
                 yield "contacts", f"the last one with {peer} went back from {before} to {epoch}"
-    used = sum(life.node.agent.counters.get(name, 0) - life.counted.get(name, 0) for name in USED)
+    for peer in life.node.endpoint.peers():
+        # Who has begun anew, or says so, counts its contacts anew.
+        if life.peers.get(peer.peer) != (begun := (peer.boot_id, peer.incarnation)):
+            life.peers[peer.peer] = begun
+            life.contacts.pop(peer.peer, None)
+            life.used = {item for item in life.used if item[0] != peer.peer}
+    counters = life.node.agent.counters
+    used = sum(counters.get(name, 0) - life.counted.get(name, 0) for name in USED)
+    # A contact may be used and its correlation given up at the same event.
+    given_up = counters.get("pair.fallback", 0) > life.counted.get("pair.fallback", 0)
     fresh = {item for item in newest.items() if item[1] != life.contacts.get(item[0])}
-    if used and not fresh:
+    if used and not fresh and not given_up:
         yield "once", "the last contact with a peer was used again"
     again = next(iter(sorted(fresh & life.used)), None)
     if used and again is not None:

@@ -31,6 +31,7 @@ from network.messages import (
     TeamReport,
 )
 from network.wire import decode, encode
+from tests.sizes import sized
 
 Array = NDArray[np.float64]
 
@@ -215,7 +216,7 @@ PLAYED = played()
 IN_ORDER = heard_in_order(PLAYED, "r2")
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=sized(20, 60), deadline=None)
 @given(st.data())
 def test_the_order_of_messages_and_their_repetition_do_not_matter(data: st.DataObject) -> None:
     """Own events come in their order, messages between them or after them, some of them several times."""
@@ -241,7 +242,7 @@ def test_the_order_of_messages_and_their_repetition_do_not_matter(data: st.DataO
     assert sum(len(instant.data) for instant in filter_._history._instants) == 10 * STEPS
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=sized(13, 40), deadline=None)
 @given(st.lists(st.booleans(), min_size=2 * STEPS, max_size=2 * STEPS))
 def test_single_losses_change_nothing(drawn: list[bool]) -> None:
     """Of each robot no two messages in a row are lost, and the last one arrives."""
@@ -505,7 +506,7 @@ def filter_names(agent: Agent) -> list[object]:
     return list(agent.filter._history._known)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=sized(13, 40), deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_no_valid_message_stops_a_robot_or_spoils_its_covariance(seed: int) -> None:
     """Numbers of any size, sums that contradict each other, lives that begin anywhere, in messages that are valid."""

@@ -178,9 +178,9 @@ def test_names_differ_and_a_clock_that_was_set_stays() -> None:
 SCENARIO = """
 version = 1
 name = "trio"
-duration_s = 54.0
+duration_s = 45.0
 step_s = 0.5
-window_s = [5.0, 54.0]
+window_s = [5.0, 45.0]
 
 [localization]
 pair_interval_s = 1.0
