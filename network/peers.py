@@ -15,7 +15,7 @@ from network.clock import PeerClock
 
 WINDOW = 1024
 DOUBLED_AFTER = 3
-"""So many messages in a row, sent by a former life after the present one has begun, are no stragglers."""
+"""So many messages, sent by a former life after the present one has begun, are no stragglers."""
 MAX_PEERS = 64
 MAX_BOOT_IDS = 16
 """Superseded boot ids remembered per peer; sixteen restarts outlast every message still under way."""
