@@ -8,18 +8,16 @@ its place by a rewind (`agent.replay`). Nothing from outside raises.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agent.cooperative_filter import CooperativeFilter
-from agent.effects import Alarm, Effect, Estimate, Persist, Publish, Send, TrackEstimate
+from agent.effects import Alarm, Effect, Estimate, Persist, Publish, Send
 from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError, absolute_model, relative_model, told
 from agent.events import ClockJudged, Event, Fix, LinkChange, Observation, Odometry, Received, Tick
+from agent.figures import MAX_KINDS, Figures, known
 from agent.forms import build_filter
 from agent.health import Health
 from agent.replay import MAX_LOGGED, ReplayLog
@@ -28,19 +26,6 @@ from agent.settings import AgentSettings
 from agent.timeline import MAX_INCREMENTS, MAX_WAITING, Item, OdometryTrack, Phase, Timeline
 from agent.waiting_filter import WaitingFilter
 from network.messages import PairReply, PairRequest, SplitReply, SplitRequest, StartRequest
-
-Array = NDArray[np.float64]
-
-MAX_KINDS = 64
-"""Kinds of measurements that figures are kept of: fixes, landmarks, sightings and contacts, the last one `other`."""
-
-
-@dataclass(slots=True)
-class NisSum:
-    """Sum and number of normalized innovations squared per degree of freedom, for one kind of measurement."""
-
-    total: float = 0.0
-    count: int = 0
 
 
 class Agent:
@@ -52,8 +37,9 @@ class Agent:
         if restored is not None:
             settings = restored.settings(settings)
         self.settings = settings
-        self.counters: Counter[str] = Counter()
-        self.nis: dict[str, NisSum] = {}
+        self.figures = Figures()
+        self.counters = self.figures.counters
+        self.nis = self.figures.nis
         self.now_ns = settings.start_ns if restored is None else restored.t_ns
         lateness = settings.lateness
         replayed = lateness.kind == "replay"
@@ -61,12 +47,14 @@ class Agent:
         self._odometry = OdometryTrack(settings.coast, settings.lateness.tolerance_ns, self.counters)
         saved = None if restored is None else restored.saved
         self.health = Health(settings.health, self.counters, None if restored is None else restored.verdicts)
-        self.filter: CooperativeFilter = build_filter(settings, self.counters, self._count_nis, self.health, saved)
+        figures = self.figures
+        self.filter: CooperativeFilter = build_filter(
+            settings, figures.counters, figures.count_nis, self.health, saved
+        )
         self._log: ReplayLog | None = None
         if replayed:
             self._log = ReplayLog(lateness.horizon_ns, lateness.tolerance_ns, self.filter.t_ns, self.counters)
         self._again_until_ns = self.filter.t_ns
-        self._quiet = False
         self._commit()
         self._persisted: object = None
         self._persist_due_ns = self.now_ns
@@ -149,7 +137,7 @@ class Agent:
             begun = self.filter.begun()
             if begun is not None:
                 self.settings = begun
-                self.filter = build_filter(begun, self.counters, self._count_nis, self.health)
+                self.filter = build_filter(begun, self.counters, self.figures.count_nis, self.health)
                 self._again_until_ns = self.filter.t_ns
                 self._commit()
 
@@ -177,18 +165,10 @@ class Agent:
         """A plain summary for people: instant, position and its deviation, pairs, counters."""
         estimate = self.filter.estimate()
         form, why = self.filter.form()
-        known: dict[str, object] = {"state": "waiting", "missing": list(self.missing())}
-        if estimate is not None:
-            known = {
-                "state": "running",
-                "x_m": float(estimate.mean[0]),
-                "y_m": float(estimate.mean[1]),
-                "sigma_m": _sigma_m(estimate.cov),
-                "tracks": {track.target: _track_status(track, estimate.t_ns) for track in estimate.tracks},
-            }
+        waiting = {"state": "waiting", "missing": list(self.missing())}
         return {
             "t_ns": self.filter.t_ns,
-            **known,
+            **(waiting if estimate is None else known(estimate)),
             "lag_s": (self.now_ns - self.filter.t_ns) * 1e-9,
             "form": form,
             "form_reason": why,
@@ -320,7 +300,7 @@ class Agent:
         if self._log is not None:
             self._log.settle(before)
             self._log.mark(before, self.filter.mark(), self._odometry)
-        with self._quietly(before < self._again_until_ns):
+        with self.figures.kept(before < self._again_until_ns):
             t_ns, delta, cov = self._odometry.step(before, until_ns)
             self.filter.advance(t_ns, delta, cov)
         self._again_until_ns = max(self._again_until_ns, t_ns)
@@ -350,7 +330,7 @@ class Agent:
                 self._process(item, effects)
         else:
             late = item.t_ns < self.filter.t_ns - self.settings.lateness.tolerance_ns
-            with self._quietly(self._log.used(item, self.filter.t_ns)):
+            with self.figures.kept(self._log.used(item, self.filter.t_ns)):
                 self._process(item, effects)
             if late:
                 self._commit()
@@ -369,20 +349,6 @@ class Agent:
         """What was used up to now is not to be used again."""
         if self._log is not None:
             self._log.commit(self.filter.t_ns, self.filter.mark(), self._odometry)
-
-    @contextmanager
-    def _quietly(self, quiet: bool) -> Iterator[None]:
-        """Leave all figures as they are."""
-        if not quiet:
-            yield
-            return
-        kept, self._quiet = dict(self.counters), True
-        try:
-            yield
-        finally:
-            self._quiet = False
-            self.counters.clear()
-            self.counters.update(kept)
 
     # -- one instant ----------------------------------------------------------------------------------------
 
@@ -447,23 +413,3 @@ class Agent:
             self.counters["observation.clock_unusable"] += len(measurements)
             return
         self.filter.measured(peer, t_ns, self.now_ns, tuple(measurements), effects)
-
-    def _count_nis(self, kind: str, nis: float) -> None:
-        if self._quiet:
-            return
-        # A peer says which kinds it has measured at an instant: there are more mixtures than anybody wants figures of.
-        if kind not in self.nis and len(self.nis) >= MAX_KINDS - 1:
-            kind = "other"
-        entry = self.nis.setdefault(kind, NisSum())
-        entry.total += nis
-        entry.count += 1
-
-
-def _sigma_m(cov: Array) -> float:
-    """Standard deviation of x and y, root mean square of both."""
-    return float(np.sqrt(max(np.trace(cov[:2, :2]) / 2.0, 0.0)))
-
-
-def _track_status(track: TrackEstimate, t_ns: int) -> dict[str, float]:
-    found = {"x_m": float(track.mean[0]), "y_m": float(track.mean[1]), "sigma_m": _sigma_m(track.cov)}
-    return found if track.learnt_ns is None else {**found, "age_s": max(t_ns - track.learnt_ns, 0) * 1e-9}

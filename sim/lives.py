@@ -10,8 +10,8 @@ from typing import Any
 
 from agent.clock_faults import FaultyClock
 from agent.config import AgentConfig
-from agent.core import NisSum
 from agent.effects import Persist
+from agent.figures import NisSum
 from agent.node import Node, Recorder, rejected
 from agent.settings import nanoseconds
 from agent.state_file import Found

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agent.core import MAX_KINDS, Agent
+from agent.core import Agent
 from agent.effects import Send
 from agent.events import LinkChange, Observation, Odometry, Received
+from agent.figures import MAX_KINDS
 from agent.peer_tables import remember
 from agent.settings import NS, AgentSettings, LatenessSettings, LocalizationSettings
 from network.messages import Header, Message, PairReply, PairRequest, ReplyStatus
@@ -82,10 +83,10 @@ def refusal_of(peer: str) -> PairReply:
 def test_figures_are_kept_of_so_many_kinds_of_contacts_however_they_are_mixed() -> None:
     found = agent("split_joint")
     for index, kinds in enumerate(product(("bearing", "range"), repeat=7)):
-        found._count_nis("pair_" + "+".join(kinds), 1.0 + index)
+        found.figures.count_nis("pair_" + "+".join(kinds), 1.0 + index)
     assert len(found.nis) == MAX_KINDS
     assert found.nis["other"].count == 2**7 - (MAX_KINDS - 1)
-    found._count_nis("pair_" + "+".join(["bearing"] * 7), 1.0)
+    found.figures.count_nis("pair_" + "+".join(["bearing"] * 7), 1.0)
     assert found.nis["pair_" + "+".join(["bearing"] * 7)].count == 2
 
 
