@@ -235,6 +235,14 @@ class BiasPart(SensorFaultPart):
     bias: Finite
 
 
+class SensorDelayPart(SensorFaultPart):
+    """The data reach the robot late by `delay_s` and an exponential time of mean `tail_s`, which reorders them."""
+
+    kind: Literal["sensor_delay"]
+    delay_s: NotNegative = 0.0
+    tail_s: NotNegative = 0.0
+
+
 class SilencePart(TimedPart):
     """A robot's autopilot is silent: no odometry, no fix of its own."""
 
@@ -334,7 +342,7 @@ AnyLinkFaultPart = (
     | CorruptPart
 )
 AnyClockFaultPart = ClockStepPart | ClockDriftPart
-AnySensorFaultPart = DropoutPart | OutliersPart | BiasPart | SilencePart
+AnySensorFaultPart = DropoutPart | OutliersPart | BiasPart | SensorDelayPart | SilencePart
 AnyProcessFaultPart = CrashPart | RestartPart | PausePart
 AnyFaultPart = AnyLinkFaultPart | ForgePart | AnySensorFaultPart | AnyClockFaultPart | AnyProcessFaultPart
 FaultPart = Annotated[AnyFaultPart, Field(discriminator="kind")]
@@ -374,23 +382,6 @@ def check_faults(faults: Iterable[AnyFaultPart], robots: Iterable[str]) -> None:
         stranger = next((robot for robot in fault.names() if robot not in there), None)
         if stranger is not None:
             raise ConfigError(f"faults.{name}: no robot '{stranger}'; there are: {', '.join(there)}")
-
-
-def told(name: str, fault: AnyFaultPart) -> str:
-    """A fault in words, for people."""
-    keys = fault.model_dump(exclude_defaults=True, exclude={"id", "kind", "at_s", "for_s"})
-    values = ", ".join(f"{key} {_plain(value)}" for key, value in keys.items())
-    until = "to the end" if fault.for_s is None else f"for {fault.for_s:g} s"
-    if isinstance(fault, RestartPart) and fault.for_s is None:
-        until = "once"
-    title = fault.kind if name.startswith(fault.kind) else f"{name} ({fault.kind})"
-    return f"{title} at {fault.at_s:g} s {until}" + (f": {values}" if values else "")
-
-
-def _plain(value: object) -> str:
-    if isinstance(value, list):
-        return "+".join(_plain(item) for item in value)
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _ids(names: list[str] | None) -> frozenset[str] | None:

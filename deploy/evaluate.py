@@ -13,7 +13,7 @@ from typing import Any
 from agent.clock_faults import FaultyClock
 from agent.effects import Effect, Publish, Send
 from agent.events import Event, Received
-from agent.fault_parts import BiasPart, ClockDriftPart, ClockStepPart, DropoutPart, OutliersPart, SilencePart
+from agent.fault_parts import AnySensorFaultPart, ClockDriftPart, ClockStepPart
 from agent.recording import RecordingError, merge, read_boundary, unpack
 from deploy.agent_files import life_files
 from deploy.launch import Outcome
@@ -40,7 +40,7 @@ def collect(
     """A `TrialResult` as the virtual engine gives it, from recordings and what the agents said at their end."""
     sensed = FaultyWorld(world, seed, {robot.id: autopilot_fix(robot) for robot in scenario.robots})
     for name, fault in trial_faults(scenario, seed).items():
-        if isinstance(fault, DropoutPart | OutliersPart | BiasPart | SilencePart):
+        if isinstance(fault, AnySensorFaultPart):
             sensed.add(name, fault)
     sampler, contacts = _sampled(scenario, world, run_dir, outcome.t0_ns, seed, with_bound)
     counters: dict[str, dict[str, int]] = {}

@@ -30,6 +30,7 @@ PLACES = {
     "sensor_dropout": ("robot", "sensor"),
     "sensor_outliers": ("robot", "sensor"),
     "sensor_bias": ("robot", "sensor"),
+    "sensor_delay": ("robot", "delay_s", "tail_s"),
     "autopilot_silence": ("robot",),
     "clock_step": ("robot", "offset_s"),
     "clock_drift": ("robot", "ppm"),

@@ -18,7 +18,8 @@ from typing import Any
 
 from agent.config import InjectionPart
 from agent.config_file import ConfigError, validate
-from agent.fault_parts import AnyFaultPart, told
+from agent.fault_parts import AnyFaultPart
+from agent.fault_words import told
 from agent.settings import nanoseconds
 from sim.agents import table
 from sim.fault_plan import trial_faults

@@ -152,7 +152,7 @@ class VirtualEngine:
         outputs = self._world.outputs(self._k)
         self._measured.add(outputs)
         for item in outputs:
-            self._push(item.t_ns, int(item.phase), item.robot, item)
+            self._push(item.t_ns + item.late_ns, int(item.phase), item.robot, item)
         self._play(self._k)
         self.step_us.append((time.perf_counter() - started) * 1e6 / len(self._processes))
         if self._bound is not None:

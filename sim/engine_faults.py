@@ -9,16 +9,13 @@ from typing import Protocol
 from agent.clock_faults import FaultyClock
 from agent.fault_parts import (
     AnyFaultPart,
-    BiasPart,
+    AnySensorFaultPart,
     ClockDriftPart,
     ClockStepPart,
     CrashPart,
-    DropoutPart,
     ForgePart,
-    OutliersPart,
     PausePart,
     RestartPart,
-    SilencePart,
 )
 from agent.settings import nanoseconds
 from network.faults import FOREVER_NS, LinkFaults
@@ -92,7 +89,7 @@ class EngineFaults:
             raise ValueError(f"there is a fault '{name}' already")
         self._faults[name] = fault
         match fault:
-            case DropoutPart() | OutliersPart() | BiasPart() | SilencePart():
+            case _ if isinstance(fault, AnySensorFaultPart):
                 self._world.add(name, fault)
             case ClockStepPart() | ClockDriftPart():
                 self.clock(fault.robot).add(fault.clock())

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.observation import RELATIVE_ANGLES
-from agent.fault_parts import AnySensorFaultPart, BiasPart, DropoutPart, OutliersPart, SilencePart
+from agent.fault_parts import AnySensorFaultPart, BiasPart, DropoutPart, OutliersPart, SensorDelayPart, SilencePart
+from agent.settings import nanoseconds
+from network.faults import exponential_ns
 from sim.noise import generator
 from sim.world import Output, World
 
@@ -95,12 +97,17 @@ class FaultyWorld:
     def _of_autopilot(self, item: Output) -> bool:
         return item.kind == ODOMETRY or (item.of is None and item.sensor == self._from_autopilot.get(item.robot))
 
-    def _changed(self, name: str, fault: DropoutPart | OutliersPart | BiasPart, item: Output) -> Output | None:
+    def _changed(
+        self, name: str, fault: DropoutPart | OutliersPart | BiasPart | SensorDelayPart, item: Output
+    ) -> Output | None:
         if isinstance(fault, BiasPart):
             z = item.z.copy()
             z[0] += fault.bias
             return replace(item, z=_possible(item.kind, z))
         draw = generator(self._seed, name, item.robot, item.sensor, item.of or "", str(item.t_ns))
+        if isinstance(fault, SensorDelayPart):
+            tail_ns = exponential_ns(nanoseconds(fault.tail_s), draw.random())
+            return replace(item, late_ns=item.late_ns + nanoseconds(fault.delay_s) + tail_ns)
         if draw.random() >= fault.share:
             return item
         if isinstance(fault, DropoutPart):

@@ -25,16 +25,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from agent.clock_faults import FaultyClock
 from agent.control import ControlLine
 from agent.estimation.motion import LAYOUTS
-from agent.fault_parts import (
-    AnyFaultPart,
-    BiasPart,
-    ClockDriftPart,
-    ClockStepPart,
-    DropoutPart,
-    OutliersPart,
-    SilencePart,
-    made,
-)
+from agent.fault_parts import AnyFaultPart, AnySensorFaultPart, ClockDriftPart, ClockStepPart, made
 from agent.fleet_clock import FleetClock
 from agent.sensor_input import encode
 from agent.settings import nanoseconds
@@ -163,13 +154,10 @@ class WorldHost:
             self._add(name, fault, t0_ns)
 
     def _add(self, name: str, fault: AnyFaultPart, t0_ns: int) -> None:
-        match fault:
-            case DropoutPart() | OutliersPart() | BiasPart() | SilencePart():
-                self._world.add(name, fault)
-            case ClockStepPart() | ClockDriftPart():
-                self._clocks[fault.robot].add(fault.clock(t0_ns))
-            case _:
-                pass
+        if isinstance(fault, AnySensorFaultPart):
+            self._world.add(name, fault)
+        elif isinstance(fault, ClockStepPart | ClockDriftPart):
+            self._clocks[fault.robot].add(fault.clock(t0_ns))
 
     async def _hear(self, t0_ns: int, control: ControlLine) -> None:
         """Faults that are added to the run, and ended, while it goes on."""
@@ -208,16 +196,17 @@ class WorldHost:
             server.stand_in.set_odometry(clock.t0_ns, np.zeros(4))
             self._place(robot, 0, clock.t0_ns)
             server.push(clock.t0_ns)
+        groups: dict[int, list[Output]] = {}
         for k in range(1, world.steps + 1):
             end = k * world.step_ns
-            groups: dict[int, list[Output]] = {}
             for item in world.outputs(k):
-                groups.setdefault(item.t_ns, []).append(item)
-            for t_ns, items in sorted(groups.items()):
+                groups.setdefault(item.t_ns + item.late_ns, []).append(item)
+            for t_ns in sorted(t_ns for t_ns in groups if t_ns <= end):
+                items = groups.pop(t_ns)
                 await self._until(clock, clock.t0_ns + t_ns)
                 if t_ns == end:
                     self._publish_reach(k, clock.t0_ns + end)
-                self._emit(k, clock.t0_ns + t_ns, items)
+                self._emit(k, clock.t0_ns, items)
             if k % 10 == 0:
                 control.say({"status": {"progress": k / world.steps}})
         # The last instant settles and its exchanges end before the agents are stopped.
@@ -240,20 +229,23 @@ class WorldHost:
         heading = float(self._world.truth(robot, k)[layout.heading])
         self._servers[robot].stand_in.set_state(t_ns, x, y, z, heading, 0.0, 0.0, 0.0, 0.0)
 
-    def _emit(self, k: int, t_ns: int, items: list[Output]) -> None:
-        """Odometry and fixes by MAVLink, all else to the sensor sockets."""
+    def _emit(self, k: int, t0_ns: int, items: list[Output]) -> None:
+        """Odometry and fixes by MAVLink, all else to the sensor sockets.
+
+        A late fix goes with the next odometry; one that a newer fix has overtaken does not go at all.
+        """
         moved = []
         for item in items:
-            stand_in = self._servers[item.robot].stand_in
+            stand_in, t_ns = self._servers[item.robot].stand_in, t0_ns + item.t_ns
             if item.kind == "odometry":
                 stand_in.set_odometry(t_ns, item.z)
-                moved.append(item.robot)
+                moved.append((item.robot, t_ns))
             elif item.of is None and item.sensor == self._fixes[item.robot]:
                 place, heading = (item.z[:-1], item.z[-1]) if item.kind == "pose" else (item.z, None)
                 stand_in.set_fix(t_ns, place[0], place[1], place[2] if len(place) == 3 else 0.0, heading)
             else:
                 self._send_sensor(item, t_ns)
-        for robot in moved:
+        for robot, t_ns in moved:
             self._place(robot, k, t_ns)
             if not self._world.silenced(robot, k * self._world.step_ns):
                 self._servers[robot].push(t_ns)

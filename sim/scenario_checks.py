@@ -11,7 +11,7 @@ from agent.config_parts import (
 )
 from agent.estimation.motion import LAYOUTS
 from agent.estimation.observation import RELATIVE_ANGLES
-from agent.fault_parts import AnyFaultPart, SensorFaultPart, check_faults, named
+from agent.fault_parts import AnyFaultPart, SensorDelayPart, SensorFaultPart, check_faults, named
 from agent.joint_room import check_room
 from agent.start_config import check_start
 from sim.scenario import KINDS, MIN_STEP_S, RobotPart, Scenario, SensorPart, TargetPart, sensor_kind
@@ -116,6 +116,8 @@ def check_schedule(scenario: Scenario, faults: list[AnyFaultPart]) -> None:
             there = sorted(robots[fault.robot].sensors)
             if fault.sensor not in there:
                 raise ConfigError(f"{where}: {fault.robot} has no sensor '{fault.sensor}'; it has: {', '.join(there)}")
+        if isinstance(fault, SensorDelayPart) and not fault.delay_s + fault.tail_s > 0.0:
+            raise ConfigError(f"{where}: nothing is late by it; state delay_s, tail_s or both")
         if fault.at_s >= scenario.duration_s:
             raise ConfigError(f"{where}: at_s = {fault.at_s:g} is after the run's end at {scenario.duration_s:g} s")
 

@@ -6,7 +6,7 @@ from collections import Counter
 from typing import Any
 
 from agent.fault_parts import named as stated
-from agent.fault_parts import told
+from agent.fault_words import told
 from sim.engine import TrialResult
 from sim.fault_plan import trial_faults
 from sim.metrics import combine, reduce_trial

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,8 @@ Array = NDArray[np.float64]
 MS = 1_000_000
 NAN = math.nan
 HDG_UNKNOWN = 65535
+MAX_MOVES = 1024
+"""Increments of odometry by which a late fix is carried on."""
 FLAVOURS = {"ardupilot": dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": dialect.MAV_AUTOPILOT_PX4}
 SENDS = ("odometry", "global_position", "attitude", "local_position")
 
@@ -94,6 +97,7 @@ class Telemetry:
         self._odometry_ns: int | None = None
         self._body_velocity: Array | None = None
         self._reset_counter = 0
+        self._moves: deque[tuple[int, Array]] = deque(maxlen=MAX_MOVES)
 
     @property
     def gps_aided(self) -> bool:
@@ -130,19 +134,25 @@ class Telemetry:
     def set_fix(self, t_ns: int, x: float, y: float, z: float, heading: float | None) -> None:
         """What the vehicle's global estimate says at `t_ns`, errors included: fleet ENU [m], [rad].
 
-        Without a heading the vehicle goes by that of its drifting local frame, and does not tell where it heads.
+        Without a heading the vehicle goes by that of its drifting local frame, and does not tell where it heads. A fix
+        that comes after the odometry of later instants is carried on by it; one older than the last is not used.
         """
+        if self._fix is not None and t_ns < self._fix.t_ns:
+            return
+        later = [(end_ns, delta) for end_ns, delta in self._moves if end_ns > t_ns]
         self._fix_has_heading = heading is not None
-        self._fix = Pose(
-            t_ns, np.array([x, y, z], dtype=np.float64), self._local.heading if heading is None else heading
-        )
-        self._global = self._fix
+        if heading is None:
+            heading = frames.wrap(self._local.heading - sum(float(delta[3]) for _, delta in later))
+        self._fix = self._global = Pose(t_ns, np.array([x, y, z], dtype=np.float64), heading)
+        for end_ns, delta in later:
+            self._global = self._global.moved(end_ns, delta)
         self._know_origin(self._fix)
 
     def set_odometry(self, t_ns: int, delta: Array) -> None:
         """Motion (dx, dy, dz, dyaw) in the body frame since the last call, reported at `t_ns`."""
         delta = np.asarray(delta, dtype=np.float64)
         self._local = self._local.moved(t_ns, delta)
+        self._moves.append((t_ns, delta))
         if self._fix is not None and self._global is not None and t_ns > self._global.t_ns:
             self._global = self._global.moved(t_ns, delta)
         if self._odometry_ns is not None and t_ns > self._odometry_ns:

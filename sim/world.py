@@ -35,7 +35,8 @@ Array = NDArray[np.float64]
 class Output:
     """One sensor datum at `t_ns` since the start; odometry covers [t0_ns, t_ns].
 
-    `attitude` is the roll and pitch [rad] the robot tells with it; None: level.
+    `attitude` is the roll and pitch [rad] the robot tells with it; None: level. It reaches the robot `late_ns` after
+    `t_ns`.
     """
 
     t_ns: int
@@ -48,6 +49,7 @@ class Output:
     R: Array
     t0_ns: int | None = None
     attitude: tuple[float, float] | None = None
+    late_ns: int = 0
 
 
 class World(Protocol):

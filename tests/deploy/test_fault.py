@@ -33,6 +33,10 @@ WORDS: list[tuple[str, dict[str, Any]]] = [
     ("kill r3", {"kind": "crash", "robot": "r3"}),
     ("crash r3 state=lost", {"kind": "crash", "robot": "r3", "state": "lost"}),
     ("pause r2 for_s=2.0", {"kind": "pause", "robot": "r2", "for_s": 2.0}),
+    (
+        "sensor_delay r1 0.5 0.2 sensor=range",
+        {"kind": "sensor_delay", "robot": "r1", "delay_s": 0.5, "tail_s": 0.2, "sensor": "range"},
+    ),
     ("clock_step r2 -0.3", {"kind": "clock_step", "robot": "r2", "offset_s": -0.3}),
     (
         "delay delay_s=0.1 sources=r1 destinations=r2,r3 both_ways=false",
@@ -153,6 +157,8 @@ def test_faults_of_processes_are_played_by_the_launcher() -> None:
         ({"inject": {"kind": "loss", "share": 0.5, "at_s": 3.0}}, "at_s = 3 is over; the run is at 10 s"),
         ({"inject": {"kind": "loss", "share": 0.5, "at_s": 1e6}}, "after the run's end"),
         ({"inject": {"kind": "sensor_dropout", "robot": "r1", "sensor": "sonar"}}, "has no sensor 'sonar'"),
+        ({"inject": {"kind": "sensor_delay", "robot": "r1"}}, "state delay_s, tail_s or both"),
+        ({"inject": {"kind": "sensor_delay", "robot": "r1", "delay_s": -1.0}}, "delay_s' = -1.0"),
         ({"inject": {}}, "kind' is missing"),
         ({"inject": {"kind": "loss", "share": 0.5, "id": 7}}, "id' = 7"),
         ({"end": "loss-1"}, "there is no 'loss-1' that goes on; there are: none"),

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agent.recording import replay
+from agent.events import Fix, Observation
+from agent.recording import read_agents, read_boundary, replay
 from sim.metrics import nees
 from sim.store import load_trace
 
@@ -56,6 +57,12 @@ kind = "autopilot_silence"
 robot = "r1"
 at_s = 8.0
 for_s = 1.5
+
+[[faults]]
+kind = "sensor_delay"
+robot = "r1"
+delay_s = 0.2
+tail_s = 0.4
 
 [[faults]]
 kind = "forge"
@@ -154,7 +161,29 @@ def test_who_is_killed_is_gone_for_as_long_as_stated(runs: tuple[Path, dict[str,
 
 def test_the_faults_are_told_alike(runs: tuple[Path, dict[str, Any], dict[str, Any]]) -> None:
     _, virtual, processes = runs
-    assert virtual["faults"] == processes["faults"] and len(virtual["faults"]) == 13
+    assert virtual["faults"] == processes["faults"] and len(virtual["faults"]) == 14
+
+
+def waits_s(folder: Path, of_autopilot: bool) -> dict[int, float]:
+    """How long after its instant [ms since the start] each sighting, or each fix, of r1 came to its core."""
+    path = folder / "recording.mcap"
+    start_ns = read_agents(path)["r1"][1]
+    kind = Fix if of_autopilot else Observation
+    return {
+        round((event.t_meas_ns - start_ns) * 1e-6): (event.t_ns - event.t_meas_ns) * 1e-9
+        for event, _ in read_boundary(path, "r1")
+        if isinstance(event, kind) and (of_autopilot or event.of == "target:t1")
+    }
+
+
+def test_sensor_data_are_late_alike_and_fixes_in_their_order(runs: tuple[Path, dict[str, Any], dict[str, Any]]) -> None:
+    virtual, processes = (waits_s(runs[0] / name, False) for name in ("virtual", "processes"))
+    shared = virtual.keys() & processes.keys()
+    assert len(shared) > 15, len(shared)
+    over = [processes[t_ms] - virtual[t_ms] for t_ms in shared]
+    assert min(over) > -0.01 and np.median(over) < 0.3, over
+    fixes = waits_s(runs[0] / "processes", True)
+    assert len(fixes) > 10 and min(fixes.values()) >= 0.2 and list(fixes) == sorted(fixes), fixes
 
 
 def test_equal_packets_have_equal_fates(runs: tuple[Path, dict[str, Any], dict[str, Any]]) -> None:

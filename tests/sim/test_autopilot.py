@@ -135,6 +135,27 @@ def test_between_fixes_the_attitude_follows_the_odometry_and_not_the_truth() -> 
     assert attitude.yawspeed == pytest.approx(0.0)
 
 
+def test_a_late_fix_keeps_its_stamp_and_is_carried_on_by_the_odometry_since() -> None:
+    stand_in = vehicle()
+    for message_id in (dialect.MAVLINK_MSG_ID_ATTITUDE, dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT):
+        stand_in.receive(BOOT, interval(message_id, 10.0))
+    for k in (1, 2, 3):
+        stand_in.set_odometry(BOOT + k * S, np.array([1.0, 0.0, 0.0, 0.25]))
+    stand_in.set_fix(BOOT + S, 3.0, 4.0, 0.0, 1.0)
+    found = {message.get_type(): message for message in decoded(stand_in.push(BOOT + 3 * S))}
+    assert found["GLOBAL_POSITION_INT"].time_boot_ms == 1000
+    assert frames.heading_from_yaw(found["ATTITUDE"].yaw) == pytest.approx(1.5, abs=1e-6)
+
+
+def test_a_fix_that_a_newer_one_has_overtaken_is_not_told() -> None:
+    stand_in = vehicle()
+    stand_in.receive(BOOT, interval(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, 10.0))
+    stand_in.set_fix(BOOT + 2 * S, 3.0, 4.0, 0.0, 1.0)
+    stand_in.set_fix(BOOT + S, 9.0, 9.0, 0.0, 1.0)
+    (position,) = decoded(stand_in.push(BOOT + 3 * S))
+    assert position.time_boot_ms == 2000
+
+
 def test_local_position_is_told_in_its_own_frame() -> None:
     stand_in = vehicle(sends=("local_position", "global_position"))
     stand_in.receive(BOOT, interval(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 10.0))

@@ -89,6 +89,27 @@ def test_outliers_are_a_share_and_far_off() -> None:
     assert changed / total == pytest.approx(0.3, abs=0.1)
 
 
+def test_delayed_data_are_those_of_the_world_and_come_in_another_order() -> None:
+    late = told({"kind": "sensor_delay", "robot": "r1", "delay_s": 0.4, "tail_s": 1.0})
+    mine = [item for item in late if item.robot == "r1" and item.kind != "odometry"]
+    assert {key(item) for item in late} == CLEAN.keys()
+    assert all(np.array_equal(item.z, CLEAN[key(item)].z) for item in late)
+    assert all(item.late_ns == 0 for item in late if item not in mine)
+    waits_s = np.array([item.late_ns * 1e-9 for item in mine])
+    assert waits_s.min() >= 0.4 and waits_s.mean() == pytest.approx(1.4, abs=0.4)
+    arrivals = [item.t_ns + item.late_ns for item in mine]
+    assert arrivals != sorted(arrivals)
+
+
+def test_delays_of_one_sensor_are_for_its_time_and_add_up() -> None:
+    fault = {"kind": "sensor_delay", "robot": "r2", "sensor": "range", "delay_s": 0.5, "at_s": 5.0}
+    for item in told({**fault, "for_s": 10.0}, {**fault, "of": "r3"}):
+        mine = item.robot == "r2" and item.sensor == "range"
+        first = 500_000_000 if mine and 5.0 <= item.t_ns * 1e-9 < 15.0 else 0
+        second = 500_000_000 if mine and item.of == "r3" and item.t_ns * 1e-9 >= 5.0 else 0
+        assert item.late_ns == first + second
+
+
 def test_a_silent_autopilot_tells_neither_odometry_nor_fix() -> None:
     left = {key(item) for item in told({"kind": "autopilot_silence", "robot": "r1", "at_s": 3.0, "for_s": 4.0})}
     gone = CLEAN.keys() - left
@@ -104,11 +125,19 @@ def test_a_silenced_autopilot_may_be_left_to_who_plays_it() -> None:
     assert not faulty.silenced("r2", 4 * 10**9)
 
 
-def test_draws_do_not_depend_on_what_was_asked_before() -> None:
-    fault = {"kind": "sensor_outliers", "robot": "r1", "share": 0.5}
-    whole = {key(item): item.z for item in told(fault)}
+@pytest.mark.parametrize(
+    "fault",
+    [
+        {"kind": "sensor_outliers", "robot": "r1", "share": 0.5},
+        {"kind": "sensor_delay", "robot": "r1", "tail_s": 0.5},
+    ],
+    ids=lambda fault: str(fault["kind"]),
+)
+def test_draws_do_not_depend_on_what_was_asked_before(fault: dict[str, Any]) -> None:
+    whole = {key(item): item for item in told(fault)}
     for item in told(fault, steps=range(40, 45)):
-        np.testing.assert_array_equal(item.z, whole[key(item)])
+        np.testing.assert_array_equal(item.z, whole[key(item)].z)
+        assert item.late_ns == whole[key(item)].late_ns
 
 
 def test_the_truth_stays() -> None:

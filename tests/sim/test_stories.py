@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from agent.fault_parts import named, told
+from agent.fault_parts import named
+from agent.fault_words import told
 from deploy.testing import FleetMaker, fleet
 from sim.invariants import InvariantBreach, InvariantChecker
 from sim.scenario import Scenario
