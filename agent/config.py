@@ -42,7 +42,7 @@ from agent.config_parts import (
     TeamMemberPart,
 )
 from agent.estimation.motion import LAYOUTS
-from agent.estimation.observation import mount_of
+from agent.estimation.mounting import mount_of
 from agent.fault_parts import FaultPart
 from agent.joint_room import check_room
 from agent.mavlink import MavlinkEndpointError, parse_endpoint

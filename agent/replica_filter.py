@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from agent.cooperative_filter import FilterMark
 from agent.effects import Broadcast, Effect, Estimate, TrackEstimate
-from agent.estimation.observation import AbsoluteModel, RelativeModel, levelled, told
+from agent.estimation.mounting import levelled
+from agent.estimation.observation import AbsoluteModel, RelativeModel, told
 from agent.events import LinkChange, Observation, Received
 from agent.pair_clock import PairClocks
 from agent.saved_state import Saved

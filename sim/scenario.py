@@ -40,7 +40,7 @@ from agent.config_parts import (
     StatePart,
 )
 from agent.estimation.motion import TargetMotion
-from agent.estimation.observation import mount_of
+from agent.estimation.mounting import mount_of
 from agent.fault_parts import FaultPart
 from agent.sensor_input import SensorConfig
 from agent.settings import nanoseconds

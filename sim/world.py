@@ -13,13 +13,8 @@ from agent.config_parts import start_size
 from agent.estimation.gain_motion import reported
 from agent.estimation.gaussian import wrap, wrap_components
 from agent.estimation.motion import LAYOUTS, SPATIAL, UNICYCLE_GAINS, StateLayout, compose, velocity_step
-from agent.estimation.observation import (
-    RELATIVE_ANGLES,
-    AbsoluteModel,
-    OutOfViewError,
-    RelativeModel,
-    mount_of,
-)
+from agent.estimation.mounting import mount_of
+from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, OutOfViewError, RelativeModel
 from agent.estimation.odometry import OdometryNoise
 from agent.events import LEVEL
 from agent.settings import NS, nanoseconds

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from agent.estimation.gaussian import square_root, symmetrize, wrap
 from agent.estimation.motion import StateLayout
-from agent.estimation.observation import RelativeModel, rotation
+from agent.estimation.mounting import rotation
+from agent.estimation.observation import RelativeModel
 from agent.estimation.track_start import MAX_HEADING_RAD, MAX_NONLINEAR, seen_place
 from agent.estimation.unscented import DEFAULT, UnscentedParameters, sigma_points, weights
 

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian import square_root, symmetrize
-from agent.estimation.observation import MIN_DEPTH_M, RelativeModel, rotation
+from agent.estimation.mounting import rotation
+from agent.estimation.observation import MIN_DEPTH_M, RelativeModel
 from agent.estimation.unscented import DEFAULT, UnscentedParameters, sigma_points, weights
 
 Array = NDArray[np.float64]

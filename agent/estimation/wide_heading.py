@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.observation import AbsoluteModel, OutOfViewError, RelativeModel, levelled, rotation
+from agent.estimation.mounting import levelled, rotation
+from agent.estimation.observation import AbsoluteModel, OutOfViewError, RelativeModel
 from agent.events import LEVEL
 from network.messages import Mount
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agent.calibration import NO_CALIBRATION, Calibration, corrected, formed
-from agent.estimation.observation import planar_mount
+from agent.estimation.mounting import planar_mount
 from agent.events import Observation, Odometry
 from agent.sensor_input import SensorConfig, decode, encode
 

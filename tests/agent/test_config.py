@@ -21,7 +21,8 @@ from agent.config_parts import (
     SigmaPart,
 )
 from agent.estimation.motion import SPATIAL, HeldAltitude, SpatialMotion
-from agent.estimation.observation import Intrinsics, planar_mount
+from agent.estimation.mounting import planar_mount
+from agent.estimation.observation import Intrinsics
 from agent.settings import AgentSettings, CoastSettings, UnsafeSettings
 from agent.target_parts import target_motion
 from agent.unsafe_parts import UnsafePart

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from agent.effects import Effect
 from agent.estimation.gaussian import is_positive_definite
-from agent.estimation.observation import Intrinsics, planar_mount
+from agent.estimation.mounting import planar_mount
+from agent.estimation.observation import Intrinsics
 from agent.events import Event, LinkChange, Observation, Odometry, Tick
 from agent.node import Node, Outgoing, rejected
 from agent.sensor_input import ABSOLUTE_KINDS, SIZES, SensorConfig, encode

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.estimation.observation import RELATIVE_ANGLES, Intrinsics, planar_mount
+from agent.estimation.mounting import planar_mount
+from agent.estimation.observation import RELATIVE_ANGLES, Intrinsics
 from agent.events import LEVEL, Fix, Observation, Odometry
 from agent.sensor_input import (
     ABSOLUTE_KINDS,

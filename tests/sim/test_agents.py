@@ -9,7 +9,7 @@ import pytest
 import tomli_w
 
 from agent.config import load_agent_config
-from agent.estimation.observation import planar_mount
+from agent.estimation.mounting import planar_mount
 from sim.agents import agent_config, agent_tables, odometry_table, table
 from sim.scenario import Scenario
 from sim.scenario_file import load

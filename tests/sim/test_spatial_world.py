@@ -13,7 +13,7 @@ from scipy import stats
 from agent.config_file import ConfigError
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import LAYOUTS, compose
-from agent.estimation.observation import rotation
+from agent.estimation.mounting import rotation
 from agent.timeline import Phase
 from sim.engine import TrialResult, VirtualEngine
 from sim.metrics import components, nees, position_errors

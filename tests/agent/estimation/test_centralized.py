@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from agent.estimation.centralized import CentralizedFilter
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import PLANAR_MOTION, UNICYCLE, TargetMotion
-from agent.estimation.observation import RelativeModel, planar_mount
+from agent.estimation.mounting import planar_mount
+from agent.estimation.observation import RelativeModel
 from agent.estimation.unscented import Transform
 
 Array = NDArray[np.float64]

@@ -24,7 +24,8 @@ from agent.estimation.colocalization import (
 from agent.estimation.gaussian import is_positive_definite, wrap
 from agent.estimation.intersection import Weight
 from agent.estimation.motion import SPATIAL, UNICYCLE
-from agent.estimation.observation import AbsoluteModel, RelativeModel, planar_mount
+from agent.estimation.mounting import planar_mount
+from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.estimation.unscented import DEFAULT, Transform
 from network.messages import NEVER, Belief, Epoch, Line, Measurement, Snapshot
 from tests.assertions import assert_consistent

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from agent.estimation.colocalization import Options, absolute_update
 from agent.estimation.motion import UNICYCLE, compose
-from agent.estimation.observation import AbsoluteModel, RelativeModel, planar_mount
+from agent.estimation.mounting import planar_mount
+from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.estimation.unscented import DEFAULT, Transform, observe
 from tests.agent.estimation.sigma_points import propagate
 

@@ -20,6 +20,7 @@ from agent.estimation.motion import (
     UNICYCLE_GAINS,
     StateLayout,
 )
+from agent.estimation.mounting import planar_mount, rotation
 from agent.estimation.observation import (
     MEASURED,
     RELATIVE_ANGLES,
@@ -30,11 +31,7 @@ from agent.estimation.observation import (
     RelativeModel,
     absolute_components,
     absolute_model,
-    levelled,
-    mount_of,
-    planar_mount,
     relative_model,
-    rotation,
     told,
 )
 from agent.estimation.unscented import observe
@@ -436,19 +433,6 @@ def test_every_kind_has_its_size_everywhere() -> None:
 # --- mounts ------------------------------------------------------------------------------------------------
 
 
-@given(HEADING, HEADING, HEADING)
-def test_a_rotation_is_one(roll: float, pitch: float, yaw: float) -> None:
-    turn = rotation(roll, pitch, yaw)
-    assert np.allclose(turn @ turn.T, np.eye(3))
-    assert np.linalg.det(turn) == pytest.approx(1.0)
-    assert np.allclose(turn, rotation(0.0, 0.0, yaw) @ rotation(0.0, pitch, 0.0) @ rotation(roll, 0.0, 0.0))
-
-
-def test_a_mount_is_stated_in_the_plane_or_in_space() -> None:
-    assert mount_of([1.0, 2.0, 0.5]) == (1.0, 2.0, 0.0, 0.0, 0.0, 0.5)
-    assert mount_of([1.0, 2.0, 3.0, 0.1, 0.2, 0.5]) == (1.0, 2.0, 3.0, 0.1, 0.2, 0.5)
-
-
 @given(
     st.one_of(MOUNT3, st.just(DOWN), st.just((0.1, 0.0, -0.1, 0.0, -math.pi / 2, 0.3))),
     st.tuples(TILT, TILT),
@@ -467,12 +451,3 @@ def test_a_peer_is_told_of_a_sensor_on_a_level_body(
     difference = wrap_components(own.h(state) - others.h(state), own.angles)
     assert np.allclose(difference, 0.0, atol=1e-3 * max(1.0, np.abs(own.h(state)).max()))
     assert np.allclose(rotation(*attitude, 0.0) @ rotation(*mount[3:]), rotation(*item.mount[3:]), atol=1e-5)
-
-
-def test_on_a_level_body_a_mount_is_what_it_is() -> None:
-    mount: Mount = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
-    assert levelled(mount, (0.0, 0.0)) is mount
-    straight = levelled(DOWN, (0.0, 0.0))
-    assert straight == DOWN
-    back = levelled(levelled(DOWN, (0.0, 0.3)), (0.0, -0.3))
-    assert np.allclose(rotation(*back[3:]), rotation(*DOWN[3:]), atol=1e-5)

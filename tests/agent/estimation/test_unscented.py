@@ -20,7 +20,8 @@ from agent.estimation.gaussian import (
     wrap_scalar,
 )
 from agent.estimation.motion import UNICYCLE, compose
-from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, RelativeModel, planar_mount
+from agent.estimation.mounting import planar_mount
+from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, RelativeModel
 from agent.estimation.unscented import (
     DEFAULT,
     Transform,
