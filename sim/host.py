@@ -181,6 +181,7 @@ class WorldHost:
                 origin=(self._scenario.origin[0], self._scenario.origin[1], self._scenario.origin[2]),
                 boot_ns=clock.t0_ns - BOOT_LEAD_NS,
                 vehicle_type=VEHICLES[LAYOUTS[part.model].altitude is not None],
+                own_fixes=self._fixes[robot] is not None,
             )
             server = StandInServer(StandIn(settings), f"udpout:127.0.0.1:{port}", clock)
             with inside(self._plan.namespaces.get(robot)):

@@ -46,7 +46,10 @@ EKF_GLOBAL, EKF_ATTITUDE_ONLY = 831, 167
 
 @dataclass(frozen=True, slots=True)
 class StandInSettings:
-    """One vehicle. `boot_ns` is the fleet instant at which it was switched on; `sends` what it can tell."""
+    """One vehicle. `boot_ns` is the fleet instant at which it was switched on; `sends` what it can tell.
+
+    `own_fixes`: the positions it tells are those of `set_fix` alone, and there is none before the first.
+    """
 
     system_id: int = 1
     flavour: str = "ardupilot"
@@ -55,6 +58,7 @@ class StandInSettings:
     boot_ns: int = 0
     vehicle_type: int = dialect.MAV_TYPE_GROUND_ROVER
     gps_accuracy_m: float | None = None
+    own_fixes: bool = False
 
     def __post_init__(self) -> None:
         if self.flavour not in FLAVOURS:
@@ -277,7 +281,7 @@ class Telemetry:
         return dialect.MAVLink_local_position_ned_message(self._boot_ms(t_ns), *frames.enu_to_ned(position), *velocity)
 
     def _global_position(self, t_ns: int) -> Any:
-        pose = self._fix or self._truth
+        pose = self._fix or (None if self.settings.own_fixes else self._truth)
         if pose is None or self._origin is None:
             return None
         stamp = t_ns if self._fix is None else pose.t_ns

@@ -147,6 +147,17 @@ def test_a_late_fix_keeps_its_stamp_and_is_carried_on_by_the_odometry_since() ->
     assert frames.heading_from_yaw(found["ATTITUDE"].yaw) == pytest.approx(1.5, abs=1e-6)
 
 
+@pytest.mark.parametrize("own_fixes", [False, True])
+def test_a_vehicle_with_fixes_of_its_own_never_tells_the_true_place(own_fixes: bool) -> None:
+    """A sensor of the scenario that is silent from the start is not replaced by a perfect one."""
+    stand_in = StandIn(StandInSettings(sends=GPS, origin=ORIGIN, boot_ns=BOOT, own_fixes=own_fixes))
+    stand_in.receive(BOOT, interval(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, 10.0))
+    stand_in.set_state(BOOT + S, 1.0, 2.0, 0.0, 0.5)
+    assert names(stand_in.push(BOOT + S)) == ([] if own_fixes else ["GLOBAL_POSITION_INT"])
+    stand_in.set_fix(BOOT + 2 * S, 3.0, 4.0, 0.0, 1.0)
+    assert names(stand_in.push(BOOT + 2 * S)) == ["GLOBAL_POSITION_INT"]
+
+
 def test_a_fix_that_a_newer_one_has_overtaken_is_not_told() -> None:
     stand_in = vehicle()
     stand_in.receive(BOOT, interval(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, 10.0))
