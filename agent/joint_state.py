@@ -18,10 +18,19 @@ from agent.estimation.colocalization import Options, sighting_update
 from agent.estimation.gaussian import is_positive_definite, symmetrize, wrap_components
 from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.estimation.split_joint import Split, SplitUpdate, update_from_peer, update_own, update_own_recurring
+from agent.factor_model import LONGEST
 from agent.joint_layout import JointLayout, Met
 from agent.joint_tracks import JointState, JointTracks, learnt
 from agent.settings import AgentSettings
-from network.messages import Measurement, SplitSnapshot
+from network.messages import (
+    MAX_JOINT_DIM,
+    MAX_MESSAGE_BYTES,
+    MAX_TARGETS,
+    Measurement,
+    SplitRequest,
+    SplitSnapshot,
+)
+from network.wire import size_bound
 
 Array = NDArray[np.float64]
 
@@ -234,6 +243,24 @@ class JointModel:
             tuple(ages),
             self.tracks.told(state)[:relayed],
         )
+
+    def fitting(self, state: JointState, measurements: tuple[Measurement, ...]) -> tuple[SplitSnapshot, int]:
+        """What a peer is told of the state beside the measurements, and how many tracks do not fit into the message."""
+        tracks, relayed, left_out = list(state.tracks), len(state.relayed), 0
+        while True:
+            snapshot = self.snapshot(state, tracks, relayed)
+            fits = (
+                len(snapshot.mean) <= MAX_JOINT_DIM
+                and len(tracks) + relayed <= MAX_TARGETS
+                and size_bound(SplitRequest(LONGEST, measurements, snapshot)) <= MAX_MESSAGE_BYTES
+            )
+            if fits or not (tracks or relayed):
+                return snapshot, left_out
+            if relayed:
+                relayed -= 1
+            else:
+                tracks.pop()
+            left_out += 1
 
     def met(
         self, state: JointState, told: SplitSnapshot, measurements: Sequence[Measurement], own_observed: bool

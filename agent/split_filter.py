@@ -36,10 +36,7 @@ from agent.saved_state import SavedSplit
 from agent.settings import AgentSettings
 from agent.split_exchange import SplitExchange
 from network.messages import (
-    MAX_JOINT_DIM,
     MAX_MEASUREMENTS,
-    MAX_MESSAGE_BYTES,
-    MAX_TARGETS,
     Body,
     Epoch,
     Measurement,
@@ -49,12 +46,10 @@ from network.messages import (
     SplitSnapshot,
     StartRequest,
 )
-from network.wire import size_bound
 
 Array = NDArray[np.float64]
 
 FAR_FUTURE_NS = 2**62
-LONGEST = Epoch(2**62, "r" * 24, 2**53)
 
 
 class SplitFilter:
@@ -228,21 +223,8 @@ class SplitFilter:
 
     def _told(self, then: JointState, measurements: tuple[Measurement, ...]) -> SplitSnapshot:
         """The belief as it is sent, with as many tracks as fit; its private noise is shared from now on."""
-        tracks, relayed = list(then.tracks), len(then.relayed)
-        while True:
-            snapshot = self._model.snapshot(then, tracks, relayed)
-            fits = (
-                len(snapshot.mean) <= MAX_JOINT_DIM
-                and len(tracks) + relayed <= MAX_TARGETS
-                and size_bound(SplitRequest(LONGEST, measurements, snapshot)) <= MAX_MESSAGE_BYTES
-            )
-            if fits or not (tracks or relayed):
-                break
-            if relayed:
-                relayed -= 1
-            else:
-                tracks.pop()
-            self._counters["pair.shortened"] += 1
+        snapshot, left_out = self._model.fitting(then, measurements)
+        self._counters["pair.shortened"] += left_out
         if snapshot.private is not None:
             self.history.learn(_shared(then), _shared)
         return snapshot

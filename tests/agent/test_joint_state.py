@@ -15,6 +15,8 @@ from agent.estimation.split_joint import Split
 from agent.joint_state import CONTRADICTIONS, JointModel
 from agent.joint_tracks import JointState
 from agent.settings import NS, AgentSettings, LocalizationSettings, TargetSettings
+from network.messages import MAX_MEASUREMENTS, MAX_MESSAGE_BYTES, Epoch, Measurement, SplitRequest, SplitSnapshot
+from network.wire import size_bound
 
 Array = NDArray[np.float64]
 
@@ -91,6 +93,24 @@ def test_tracks_are_told_and_found_by_name() -> None:
     assert only.targets == (("t2", "constant_velocity"),)
     assert np.array_equal(only.mean, np.concatenate([state.mean[:3], state.mean[7:11]]))
     assert np.array_equal(only.cov, state.cov[np.ix_([*range(3), *range(7, 11)], [*range(3), *range(7, 11)])])
+
+
+@pytest.mark.parametrize("count", [1, 3, 12])
+@pytest.mark.parametrize("measured", [0, MAX_MEASUREMENTS])
+def test_the_first_tracks_are_told_as_many_as_fit_into_a_message(count: int, measured: int) -> None:
+    subject = model("unscented", tuple(f"t{k}" for k in range(count)))
+    state = subject.tracks.initial()
+    items = (Measurement("range", np.ones(1), np.eye(1)),) * measured
+    snapshot, left_out = subject.fitting(state, items)
+
+    def size(told: SplitSnapshot) -> int:
+        return size_bound(SplitRequest(Epoch(2**62, "r" * 24, 2**53), items, told))
+
+    kept = count - left_out
+    assert [name for name, _ in snapshot.targets] == list(state.tracks)[:kept]
+    assert size(snapshot) <= MAX_MESSAGE_BYTES
+    assert left_out == 0 or size(subject.snapshot(state, state.tracks[: kept + 1])) > MAX_MESSAGE_BYTES
+    assert left_out > 0 or count == 1
 
 
 def test_an_innovation_beyond_the_cap_counts_less() -> None:
