@@ -15,7 +15,6 @@ belief follows from raw data, which its team tells no more.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -24,16 +23,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.belief import BlockKey, CorrelationStack, PairRecord, Part, RobotState, TargetState
-from agent.estimation.gaussian import is_positive_definite
 from agent.estimation.split_joint import Split
 from agent.health import SavedVerdict
 from agent.joint_layout import JointLayout
 from agent.joint_tracks import JointState, RelayedTrack
 from agent.settings import AgentSettings
+from agent.state_fields import (
+    StateError,
+    read_amount,
+    read_by_id,
+    read_cov,
+    read_dim,
+    read_flag,
+    read_many,
+    read_stamp,
+    read_targets,
+)
 from network.messages import MAX_GROUP, MAX_JOINT_DIM, NEVER, Epoch
-from network.peers import MAX_PEERS
 from network.wire_fields import (
-    MAX_INT,
     WireError,
     pack_epoch,
     read_array,
@@ -50,24 +57,8 @@ Array = NDArray[np.float64]
 
 FORMAT = 2
 MAX_BYTES = 4_000_000
-MAX_TRACKS = 256
 MAX_WINDOW = 1000
 """Contacts with a peer that a verdict on it may rest on."""
-ASYMMETRY = 1e-9
-"""Rounding, relative to the largest element, by which a covariance may be asymmetric."""
-
-
-class StateError(ValueError):
-    """A saved state that cannot be used; `reason` names why and contains nothing of it.
-
-    Of a file: `torn`, `corrupt` (checksum), `unreadable`. Of its content: `other_version`, `other_robot`, `other_form`,
-    `other_model`, `inconsistent`, and the reasons of `network.wire_fields.WireError`. Of its instant: `too_old`,
-    `from_future`, `earlier_run`.
-    """
-
-    def __init__(self, reason: str) -> None:
-        self.reason = reason
-        super().__init__(reason)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -268,30 +259,22 @@ def _decoded(raw: Any, settings: AgentSettings) -> Restored:
         raise StateError("other_form")
     if read_text(model) != settings.layout.name:
         raise StateError("other_model")
-    start_ns, t_ns = _stamp(start), _stamp(instant)
+    start_ns, t_ns = read_stamp(start), read_stamp(instant)
     if start_ns > t_ns:
         raise StateError("inconsistent")
     read = _read_split if expected == "split_joint" else _read_factors
-    return Restored(start_ns, read(settings, t_ns, mean, cov, body), _by_id(verdicts, 5, _read_verdict))
+    return Restored(start_ns, read(settings, t_ns, mean, cov, body), read_by_id(verdicts, 5, _read_verdict))
 
 
 def _read_verdict(fields: tuple[Any, ...]) -> SavedVerdict:
     recent, good, quarantined, since_ns, nis = fields
     return SavedVerdict(
-        tuple(_nis(item) for item in read_items(recent, MAX_WINDOW)),
-        tuple(_nis(item) for item in read_items(good, MAX_WINDOW)),
-        _flag(quarantined),
-        None if since_ns is None else _stamp(since_ns),
-        _nis(nis),
+        tuple(read_amount(item) for item in read_items(recent, MAX_WINDOW)),
+        tuple(read_amount(item) for item in read_items(good, MAX_WINDOW)),
+        read_flag(quarantined),
+        None if since_ns is None else read_stamp(since_ns),
+        read_amount(nis),
     )
-
-
-def _nis(raw: Any) -> float:
-    if type(raw) is not float:
-        raise StateError("wrong_type")
-    if not 0.0 <= raw <= MAX_INT:
-        raise StateError("out_of_range")
-    return raw
 
 
 def _read_factors(settings: AgentSettings, t_ns: int, mean: Any, cov: Any, body: Any) -> SavedFactors:
@@ -304,10 +287,10 @@ def _read_factors(settings: AgentSettings, t_ns: int, mean: Any, cov: Any, body:
     state = RobotState(
         t_ns,
         read_array(mean, n).copy(),
-        _cov(cov, n),
+        read_cov(cov, n),
         _read_stack(blocks, n),
-        _by_id(pairs, 4, lambda fields: _read_record(fields, settings.localization.max_lines)),
-        _targets(settings, targets, lambda mean, cov, f: TargetState(mean, cov, _stamp(f[0]), _stamp(f[1]))),
+        read_by_id(pairs, 4, lambda fields: _read_record(fields, settings.localization.max_lines)),
+        read_targets(settings, targets, lambda x, P, f: TargetState(x, P, read_stamp(f[0]), read_stamp(f[1]))),
         _read_record(read_fields(stranger, 4), 0),
     )
     if state.targets and joint is not None:
@@ -315,20 +298,23 @@ def _read_factors(settings: AgentSettings, t_ns: int, mean: Any, cov: Any, body:
     _check_stack(state, n, c, joint is not None)
     return SavedFactors(
         state,
-        _by_id(
-            exchanges, 4, lambda f: SavedExchange(read_integer(f[0]), read_epoch(f[1]), _stamp(f[2]), read_epoch(f[3]))
-        ),
-        _by_id(lives, 2, lambda f: (read_integer(f[0]), read_integer(f[1]))),
-        _by_id(inflated, 1, lambda f: _stamp(f[0])),
+        read_by_id(exchanges, 4, _read_exchange),
+        read_by_id(lives, 2, lambda f: (read_integer(f[0]), read_integer(f[1]))),
+        read_by_id(inflated, 1, lambda f: read_stamp(f[0])),
         None if group is None else frozenset(read_id(item) for item in read_items(group, MAX_GROUP)),
-        _nis(nonlinearity),
+        read_amount(nonlinearity),
     )
+
+
+def _read_exchange(fields: tuple[Any, ...]) -> SavedExchange:
+    counter, opened, until, refused = fields
+    return SavedExchange(read_integer(counter), read_epoch(opened), read_stamp(until), read_epoch(refused))
 
 
 def _read_stack(raw: Any, n: int) -> CorrelationStack:
     found: dict[BlockKey, tuple[int, int]] = {}
     parts, column = [np.zeros((n, 0))], 0
-    for item in _items(raw):
+    for item in read_many(raw):
         part, peer, epoch, width, data = read_fields(item, 5)
         key = Part(read_integer(part, max(Part))), read_text(peer) and read_id(peer), read_epoch(epoch)
         if key in found:
@@ -361,81 +347,28 @@ def _read_record(fields: tuple[Any, ...], most: int) -> PairRecord:
     epochs = tuple(read_contact(epoch) for epoch in read_items(lines, most))
     if list(epochs) != sorted(set(epochs)):
         raise StateError("inconsistent")
-    return PairRecord(read_epoch(base), _flag(known), epochs, _flag(anew))
+    return PairRecord(read_epoch(base), read_flag(known), epochs, read_flag(anew))
 
 
 def _read_split(settings: AgentSettings, t_ns: int, mean: Any, cov: Any, body: Any) -> SavedSplit:
     raw_tracks, relayed, doubted, contacts = read_fields(body, 4)
     followed, n = {}, settings.layout.dim
-    for item in _items(raw_tracks):
+    for item in read_many(raw_tracks):
         target, model, learnt = read_fields(item, 3)
-        n += _dim(settings, target, model)
-        followed[target] = _stamp(learnt)
+        n += read_dim(settings, target, model)
+        followed[target] = read_stamp(learnt)
     if len(followed) != len(raw_tracks):
         raise StateError("inconsistent")
-    P = _cov(cov, n)
+    P = read_cov(cov, n)
     state = JointState(
         t_ns,
         read_array(mean, n).copy(),
         Split(np.zeros((n, n)), P),
         tuple(followed),
         tuple(followed.values()),
-        _targets(settings, relayed, lambda mean, cov, f: RelayedTrack(mean, cov, _stamp(f[0]), _flag(f[1]))),
-        _by_id(doubted, 1, lambda f: read_integer(f[0], 2**31)),
+        read_targets(settings, relayed, lambda x, P, f: RelayedTrack(x, P, read_stamp(f[0]), read_flag(f[1]))),
+        read_by_id(doubted, 1, lambda f: read_integer(f[0], 2**31)),
     )
     if followed.keys() & state.relayed.keys():
         raise StateError("inconsistent")
-    return SavedSplit(state, _by_id(contacts, 1, lambda f: read_contact(f[0])), until_ns=t_ns)
-
-
-def _items(raw: Any) -> tuple[Any, ...]:
-    return read_items(raw, 64 * MAX_PEERS)
-
-
-def _by_id(raw: Any, count: int, read: Callable[[tuple[Any, ...]], Any], most: int = MAX_PEERS) -> dict[str, Any]:
-    """What is told of each robot or target by `count` fields."""
-    found = {}
-    for item in read_items(raw, most):
-        name, *fields = read_fields(item, count + 1)
-        if read_id(name) in found:
-            raise StateError("inconsistent")
-        found[name] = read(tuple(fields))
-    return found
-
-
-def _targets(settings: AgentSettings, raw: Any, read: Callable[..., Any]) -> dict[str, Any]:
-    """Beliefs of targets (id, model, mean, cov, and two fields more); `read` is given mean, cov and these fields."""
-    found = _by_id(raw, 5, lambda fields: fields, MAX_TRACKS)
-    for name, (model, mean, cov, *rest) in found.items():
-        dim = _dim(settings, name, model)
-        found[name] = read(read_array(mean, dim).copy(), _cov(cov, dim), rest)
-    return found
-
-
-def _dim(settings: AgentSettings, target: Any, model: Any) -> int:
-    """Components of a target's track. Raises `StateError` if the settings have no such target."""
-    motion = next((item.motion for item in settings.tracked if item.id == target), None)
-    if motion is None or motion.layout.name != read_text(model):
-        raise StateError("other_model")
-    return motion.layout.dim
-
-
-def _cov(raw: Any, n: int) -> Array:
-    P = read_array(raw, n * n).reshape(n, n).copy()
-    if np.abs(P - P.T).max() > ASYMMETRY * np.abs(P).max() or not is_positive_definite(P):
-        raise StateError("not_positive_definite")
-    return P
-
-
-def _stamp(raw: Any) -> int:
-    if type(raw) is not int:
-        raise StateError("wrong_type")
-    if abs(raw) > MAX_INT:
-        raise StateError("out_of_range")
-    return raw
-
-
-def _flag(raw: Any) -> bool:
-    if type(raw) is not bool:
-        raise StateError("wrong_type")
-    return raw
+    return SavedSplit(state, read_by_id(contacts, 1, lambda f: read_contact(f[0])), until_ns=t_ns)

@@ -16,7 +16,8 @@ from typing import Any
 
 import msgpack
 
-from agent.saved_state import MAX_BYTES, StateError
+from agent.saved_state import MAX_BYTES
+from agent.state_fields import StateError
 from network.wire_fields import valid_id
 
 FILE = "state.bin"

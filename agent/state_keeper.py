@@ -16,8 +16,9 @@ from collections import Counter
 from dataclasses import dataclass
 
 from agent.effects import Alarm, Persist
-from agent.saved_state import StateError, begun_again, decode
+from agent.saved_state import begun_again, decode
 from agent.settings import NS, AgentSettings
+from agent.state_fields import StateError
 from agent.state_file import Found, StateFile, next_incarnation
 
 log = logging.getLogger("cofix.agent")

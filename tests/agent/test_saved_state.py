@@ -15,8 +15,9 @@ from agent.core import Agent
 from agent.effects import Effect, Persist
 from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received
 from agent.recording import pack
-from agent.saved_state import FORMAT, StateError, begun_again, decode
+from agent.saved_state import FORMAT, begun_again, decode
 from agent.settings import NS, AgentSettings, LocalizationSettings
+from agent.state_fields import StateError
 from agent.state_file import Found
 from agent.state_keeper import start
 from network.messages import Header, Message

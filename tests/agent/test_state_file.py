@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from agent.effects import Alarm, Persist
-from agent.saved_state import StateError
+from agent.state_fields import StateError
 from agent.state_file import FILE, MAGIC, REFUSED, Found, StateFile, next_incarnation, pack, unpack
 from agent.state_keeper import StateKeeper
 
