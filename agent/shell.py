@@ -25,14 +25,15 @@ from agent.autopilot import AutopilotReader
 from agent.config import AgentConfig
 from agent.config_file import ConfigError
 from agent.control import ControlLine
-from agent.effects import Alarm, Estimate
+from agent.effects import Alarm
 from agent.events import Event
 from agent.fleet_clock import FleetClock
 from agent.injection import Injection
-from agent.lateness_figures import LatenessFigures
 from agent.live_recording import LiveRecording
 from agent.mavlink import MavlinkError, MavlinkLink
 from agent.node import Node, Outgoing, rejected
+from agent.node_timer import NodeTimer
+from agent.publications import Publications
 from agent.sensor_socket import SensorSocket
 from agent.settings import nanoseconds
 from agent.state_file import StateFile
@@ -43,9 +44,7 @@ from network.zenoh_transport import ZenohSettings, ZenohTransport
 log = logging.getLogger("cofix.agent")
 
 SOFTWARE = "cofix-0.1.0"
-PUBLISH_INTERVAL_S = 0.1
 STATUS_INTERVAL_S = 0.5
-ALARM_INTERVAL_S = 60.0
 
 
 class AgentShell:
@@ -66,11 +65,9 @@ class AgentShell:
         self._hearing: asyncio.Task[None] | None = None
         self._sensors = SensorSocket(self._state_dir, self.on_sensor)
         self._receive: Any = None
-        self._timer: asyncio.TimerHandle | None = None
-        self._timer_due_ns = self._timer_set_ns = self._start_ns = 0
-        self._published_s = 0.0
-        self._warned_s: dict[Alarm, float] = {}
-        self._lags = LatenessFigures()
+        self._timer = NodeTimer(lambda: self._clock, self._on_timer)
+        self._start_ns = 0
+        self._publications = Publications()
         self._stop = asyncio.Event()
         self.counters: Counter[str] = Counter()
         self._file = StateFile(self._state_dir, self.robot, config.state.sync)
@@ -185,7 +182,7 @@ class AgentShell:
 
     def _arm_anew(self) -> None:
         if self._node is not None:
-            self._timer_due_ns = -1
+            self._timer.cancel()
             self._arm()
 
     async def _begin(self) -> None:
@@ -270,11 +267,8 @@ class AgentShell:
         if self._node is not None:
             self._carry_out(self._node.on_packet(self._clock.now_ns(), packet))
 
-    def _on_timer(self) -> None:
+    def _on_timer(self, now_ns: int) -> None:
         assert self._node is not None
-        now_ns = self._clock.now_ns()
-        self._timer = None
-        self._lags.add(now_ns - self._timer_set_ns)
         self._carry_out(self._node.on_tick(now_ns))
 
     def _carry_out(self, out: Outgoing) -> None:
@@ -286,35 +280,16 @@ class AgentShell:
             else:
                 self.counters["state.held_back"] += 1
         for alarm in (*out.alarms, *self._troubles()):
-            self._warn(alarm)
-        if out.estimates:
-            wall = time.monotonic()
-            if wall - self._published_s >= PUBLISH_INTERVAL_S:
-                self._published_s = wall
-                self._transport.publish(Channel.ESTIMATE, estimate_bytes(out.estimates[-1]))
+            self._publications.warn(alarm)
+        if out.estimates and (estimate := self._publications.estimate(out.estimates[-1])) is not None:
+            self._transport.publish(Channel.ESTIMATE, estimate)
         self._arm()
 
-    def _warn(self, alarm: Alarm) -> None:
-        """Log an alarm, an equal one once per window."""
-        wall = time.monotonic()
-        if wall - self._warned_s.get(alarm, -ALARM_INTERVAL_S) >= ALARM_INTERVAL_S:
-            self._warned_s = {known: at for known, at in self._warned_s.items() if wall - at < ALARM_INTERVAL_S}
-            self._warned_s[alarm] = wall
-            log.warning("%s", f"{alarm.reason}: {alarm.detail}" if alarm.detail else alarm.reason)
-
     def _arm(self) -> None:
-        """Set the timer to the node's next deadline; never a busy loop."""
+        """Set the timer to the node's next deadline."""
         assert self._node is not None
         # A run's clock reaches its start some time after the barrier; nothing is said to peers before that.
-        deadline = max(self._node.next_deadline_ns(), self._start_ns)
-        if self._timer is not None:
-            if deadline == self._timer_due_ns:
-                return
-            self._timer.cancel()
-        now_ns = self._clock.now_ns()
-        wait_s = min(max(self._clock.wall_s(deadline - now_ns), 0.0005), 60.0)
-        self._timer_due_ns, self._timer_set_ns = deadline, max(deadline, now_ns)
-        self._timer = asyncio.get_running_loop().call_later(wait_s, self._on_timer)
+        self._timer.arm(max(self._node.next_deadline_ns(), self._start_ns))
 
     def status(self) -> dict[str, Any]:
         """What a person wants to know, as plain values."""
@@ -326,7 +301,7 @@ class AgentShell:
         status["silence_max_s"] = {peer.peer: peer.silence_max_ns * 1e-9 for peer in self._node.endpoint.peers()}
         if self._transport is not None:
             status["transport"] = dict(self._transport.counters)
-        status["lag_max_s"] = self._lags.max_ns * 1e-9
+        status["lag_max_s"] = self._timer.lags.max_ns * 1e-9
         injection = self.config.injection
         status["injected"] = injection.links.model_dump(exclude_defaults=True) if injection is not None else {}
         if self._injection is not None and (faults := self._injection.told()):
@@ -354,15 +329,14 @@ class AgentShell:
             "endpoint": dict(self._node.endpoint.counters),
             "transport": dict(self._transport.counters),
             "autopilot": dict(self._reader.counters) if self._reader is not None else {},
-            "lag_max_s": self._lags.max_ns * 1e-9,
-            "lags": self._lags.told(),
+            "lag_max_s": self._timer.lags.max_ns * 1e-9,
+            "lags": self._timer.lags.told(),
         }
 
     # -- end ------------------------------------------------------------------------------------------------
 
     async def _close(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
+        self._timer.cancel()
         if self._hearing is not None:
             self._hearing.cancel()
         figures = self._figures() if self._node is not None else None
@@ -389,17 +363,3 @@ class AgentShell:
 
 def _ignore(packet: Packet) -> None:
     """Takes the packets that still arrive while the shell closes."""
-
-
-def estimate_bytes(estimate: Estimate) -> bytes:
-    """An estimate for the `estimate` key: msgpack, arrays as lists."""
-    data: bytes = msgpack.packb(
-        {
-            "t_ns": estimate.t_ns,
-            "model": estimate.model,
-            "mean": estimate.mean.tolist(),
-            "cov": estimate.cov.tolist(),
-            "tracks": {track.target: [track.mean.tolist(), track.cov.tolist()] for track in estimate.tracks},
-        }
-    )
-    return data
