@@ -10,12 +10,12 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from agent.clock_faults import FaultyClock
 from agent.effects import Effect, Publish, Send
 from agent.events import Event, Received
-from agent.fault_parts import AnySensorFaultPart, ClockDriftPart, ClockStepPart
+from agent.fault_parts import AnySensorFaultPart
 from agent.recording import RecordingError, merge, read_boundary, unpack
 from deploy.agent_files import life_files
+from deploy.instants import Clocks, InstantEstimates, Measured
 from deploy.launch import Outcome
 from network.links import FATE_COLUMNS
 from network.messages import PairReply, ReplyStatus
@@ -25,13 +25,9 @@ from sim.engine import TrialResult, network_figures
 from sim.fault_plan import trial_faults
 from sim.faulty_world import FaultyWorld
 from sim.metrics import TrialTrace
-from sim.sampling import MeasurementLog, Sampler, sample_stride
+from sim.sampling import MeasurementLog, Sampler
 from sim.scenario import Scenario
 from sim.world import World
-
-# An estimate counts for a sampled instant if its own instant lies no further behind than so many steps.
-MAX_BEHIND_STEPS = 1.5
-AHEAD_STEPS = 0.3
 
 
 def collect(
@@ -89,22 +85,14 @@ def _sampled(
     scenario: Scenario, world: World, run_dir: Path, t0_ns: int, seed: int, with_bound: bool
 ) -> tuple[Sampler, list[tuple[float, str, str]]]:
     """Estimates at sampled instants, and the contacts in order."""
-    clocks = _clocks(scenario, seed, t0_ns)
+    clocks = Clocks(scenario, seed, t0_ns)
+    measured = Measured(scenario, clocks)
     sampler = Sampler(scenario, world, with_bound)
     contacts: list[tuple[float, str, str]] = []
     for robot in world.robots:
         paths = life_files(run_dir, robot, "mcap")
-        _sample(sampler, world, robot, paths, clocks.get(robot, FaultyClock()), t0_ns, contacts)
+        _sample(sampler, world, robot, paths, clocks, measured, t0_ns, contacts)
     return sampler, sorted(contacts)
-
-
-def _clocks(scenario: Scenario, seed: int, t0_ns: int) -> dict[str, FaultyClock]:
-    """Clocks of the robots as they were injected."""
-    found: dict[str, FaultyClock] = {}
-    for fault in trial_faults(scenario, seed).values():
-        if isinstance(fault, ClockStepPart | ClockDriftPart):
-            found.setdefault(fault.robot, FaultyClock()).add(fault.clock(t0_ns))
-    return found
 
 
 def _sample(
@@ -112,47 +100,31 @@ def _sample(
     world: World,
     robot: str,
     paths: list[Path],
-    clock: FaultyClock,
+    clocks: Clocks,
+    measured: Measured,
     t0_ns: int,
     contacts: list[tuple[float, str, str]],
 ) -> None:
-    """The last estimate published for each sampled instant, and the contacts the robot applied."""
-    stride_ns = sample_stride(world.step_ns) * world.step_ns
-    ahead, behind = AHEAD_STEPS * world.step_ns, MAX_BEHIND_STEPS * world.step_ns
-    latest = None
-    next_row = 0
-
-    def settle(until_ns: float) -> None:
-        """Fill the rows whose instant is over once an estimate for a later instant appears."""
-        nonlocal next_row
-        while latest is not None and next_row * stride_ns + ahead < until_ns and next_row * stride_ns <= span:
-            if next_row * stride_ns - (latest.t_ns - t0_ns) <= behind:
-                sampler.put(robot, robot, next_row, latest.mean, latest.cov)
-                for track in latest.tracks:
-                    sampler.put(robot, track.target, next_row, track.mean, track.cov)
-            next_row += 1
-
-    span = world.steps * world.step_ns
+    """The estimate that stands for each sampled instant, and the contacts the robot applied."""
+    clock, rows = clocks(robot), InstantEstimates(sampler, world, robot)
     with contextlib.suppress(RecordingError):
         for path in paths:
-            latest, born = None, False
+            born = False
             for event, packed in read_boundary(path, robot, unfinished=True):
                 if not born:
-                    # What a life tells of the time before it is hindsight: nobody was there to ask.
-                    next_row = max(next_row, -int((t0_ns - clock.origin_ns(event.t_ns)) // stride_ns))
+                    rows.begin(clock.origin_ns(event.t_ns) - t0_ns)
                     born = True
+                found_ns = measured.at_ns(robot, event)
+                if found_ns is not None:
+                    rows.measured(found_ns - t0_ns)
                 made = [unpack(data) for data in packed]
                 for peer in _contacts(event, made):
                     contacts.append(((event.t_ns - t0_ns) * 1e-9, robot, peer))
                 for effect in made:
                     if isinstance(effect, Publish):
-                        found = replace(effect.estimate, t_ns=clock.origin_ns(effect.estimate.t_ns))
-                        while latest is None and next_row * stride_ns + ahead < found.t_ns - t0_ns:
-                            next_row += 1  # Before the robot knew where it is.
-                        settle(found.t_ns - t0_ns)
-                        latest = found
-            if latest is not None:
-                settle(min(latest.t_ns - t0_ns + behind, span + 2 * ahead))
+                        estimate = effect.estimate
+                        rows.published(replace(estimate, t_ns=clock.origin_ns(estimate.t_ns) - t0_ns))
+            rows.end()
 
 
 def _contacts(event: Event, effects: list[Effect]) -> list[str]:

@@ -35,8 +35,7 @@ def lines(rows: list[tuple[float, ...]]) -> str:
     )
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def recorded(folder: Path) -> Path:
     """r1 drives east at 0.2 m/s, r2 stands at (2, 1); r3 moves but nobody measured where."""
     seconds = range(40)
     files = {
@@ -52,8 +51,13 @@ def folder(tmp_path: Path) -> Path:
         "Robot3_Measurement": f"{T0 + 12}.500 5 1.1 -2.4\n",
     }
     for name, text in files.items():
-        (tmp_path / f"{name}.dat").write_text("# recorded by hand\n" + text)
-    return tmp_path
+        (folder / f"{name}.dat").write_text("# recorded by hand\n" + text)
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return recorded(tmp_path)
 
 
 def scenario(folder: Path, robots: tuple[str, ...] = ("r1", "r2"), **change: Any) -> Scenario:
