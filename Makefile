@@ -57,7 +57,7 @@ check-matrix: setup
 # make check-data UTIAS7=FOLDER [TIERS=FOLDER]: the tests on recorded data, which is not part of the repository.
 check-data: setup
 	@test -n "$(UTIAS7)$(TIERS)" || { echo "check-data: give UTIAS7=FOLDER of MRCLAM_Dataset7, or TIERS=FOLDER of the UWB bags"; exit 2; }
-	COFIX_UTIAS7="$(UTIAS7)" COFIX_TIERS="$(TIERS)" $(BIN)/python -P -m pytest tests/sim/test_utias.py tests/sim/test_utias_acceptance.py tests/sim/test_tiers.py
+	COFIX_UTIAS7="$(UTIAS7)" COFIX_TIERS="$(TIERS)" $(BIN)/python -P -m pytest tests/sim/test_utias.py tests/sim/test_utias_acceptance.py tests/deploy/test_utias_processes.py tests/sim/test_tiers.py
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
