@@ -11,6 +11,7 @@ from functools import partial
 
 import pytest
 
+from benchmarks.processes import RunFailed
 from benchmarks.utias import IN_PROCESSES, Condition, Figures, conditions, delays, figures, figures_of_processes, run
 
 pytestmark = pytest.mark.realtime
@@ -50,3 +51,8 @@ def test_processes_come_to_the_figures_of_virtual_time(
 ) -> None:
     ratio = in_processes[case][key] / in_virtual_time[case][key]
     assert ratio == pytest.approx(1.0, abs=within), delays(in_processes)
+
+
+def test_a_run_that_cannot_be_played_says_why() -> None:
+    with pytest.raises(RunFailed, match="no such folder"):
+        figures_of_processes("all", "/nowhere", 1)

@@ -7,7 +7,19 @@ import os
 
 import pytest
 
-from benchmarks.utias import CASES, CONDITIONS, Condition, Figures, run, table, verdicts
+from benchmarks.utias import (
+    CASES,
+    CONDITIONS,
+    IN_PROCESSES,
+    Condition,
+    Figures,
+    conditions,
+    delays,
+    main,
+    run,
+    table,
+    verdicts,
+)
 
 UTIAS7 = os.environ.get("COFIX_UTIAS7", "")
 
@@ -66,3 +78,31 @@ def test_the_table_has_a_row_per_case_and_the_bound_beside_it() -> None:
     rows = table(made_up()).splitlines()
     assert sum(row.startswith("| A") for row in rows) == 2
     assert all(len(row.split("|")) == 10 for row in rows)
+
+
+def test_of_some_cases_only_their_conditions_are_told() -> None:
+    some = {name: made_up()[name] for name in IN_PROCESSES}
+    told = [item.what for item in conditions(some)]
+    assert len(told) == 12
+    assert {what[:2] for what in told} == {"A ", "B "}
+    assert "B position / alone" not in told
+    assert verdicts(some).count("holds") == len(told)
+    assert conditions(made_up()) == list(CONDITIONS)
+
+
+def test_of_processes_it_is_told_how_late_they_were() -> None:
+    late = {
+        "contacts": {"started": 12, "completed": 11, "one_sided": 0},
+        "lag_p99_s": 0.012,
+        "lag_max_s": 0.054,
+        "load": 3.25,
+    }
+    some = {name: made_up()[name] | late for name in IN_PROCESSES}
+    rows = delays(some).splitlines()
+    assert [row.split(" | ")[1:5] for row in rows[2:]] == [["11 of 12", "0", "12", "54"]] * 2
+
+
+def test_virtual_time_has_no_speed(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["folder", "--speed", "5"])
+    assert "--processes" in capsys.readouterr().err
