@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 
+from deploy.fault import ask, socket_of
+from sim.scenario_file import load
 from sim.store import load_trace
 
 pytestmark = pytest.mark.realtime
@@ -197,9 +199,13 @@ def test_a_killed_agent_is_told_and_the_others_finish(tmp_path: Path) -> None:
     members = run.members()
     run.wait_until_played()
     os.kill(members["r2"], signal.SIGKILL)
+    assert "error" not in ask(socket_of(run.directory), {"inject": {"kind": "loss", "share": 0.5, "id": "by-hand"}})
     status, summary, said = run.finish()
     assert status == 1
     assert summary is not None
+    # What was done by hand is told, and kept as a schedule.
+    assert summary["faults"][-1].startswith("by-hand")
+    assert [fault.id for fault in load(str(run.directory / "scenario.toml")).faults] == ["by-hand"]
     assert summary["exit"] == {"r1": 0, "r2": -signal.SIGKILL}
     assert "r2 was ended by SIGKILL" in said
     assert summary["robots"]["r1"]["position_rmse_m"] < 1.0
