@@ -215,9 +215,9 @@ def fault(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*COFIX, "fault", *words], capture_output=True, text=True, timeout=120, check=False)
 
 
-def test_a_run_that_goes_on_is_broken_and_healed_by_hand(tmp_path: Path) -> None:
-    (tmp_path / "trio.toml").write_text(SCENARIO + "".join(ROBOT.format(k=k) for k in (1, 2, 3)))
-    out = tmp_path / "run"
+def test_a_run_that_goes_on_is_broken_and_healed_by_hand(short_path: Path) -> None:
+    (short_path / "trio.toml").write_text(SCENARIO + "".join(ROBOT.format(k=k) for k in (1, 2, 3)))
+    out = short_path / "run"
 
     async def injected(*words: str) -> str:
         done = await asyncio.to_thread(fault, str(out), *words)
@@ -226,7 +226,7 @@ def test_a_run_that_goes_on_is_broken_and_healed_by_hand(tmp_path: Path) -> None
 
     async def by_hand(live: Live) -> None:
         """The run goes on until all is done, however long the commands take."""
-        (there,) = tmp_path.glob("cofix-*/faults.sock")
+        (there,) = short_path.glob("cofix-*/faults.sock")
         assert stat.S_IMODE(there.stat().st_mode) == 0o600
         live.notes["cut"] = cut = await injected("partition", "r1,r2", "r3")
         live.notes["killed"] = killed = await injected("kill", "r2")
@@ -252,7 +252,7 @@ def test_a_run_that_goes_on_is_broken_and_healed_by_hand(tmp_path: Path) -> None
         live.notes["end_s"] = known_until_s()
         live.launcher.interrupt()
 
-    played = play(tmp_path, load(str(tmp_path / "trio.toml")), speed=3.0, disturb=by_hand)
+    played = play(short_path, load(str(short_path / "trio.toml")), speed=3.0, disturb=by_hand)
     cut, killed, end_s = (played.notes[name] for name in ("cut", "killed", "end_s"))
     assert played.outcome.exits == {"r1": 0, "r2": 0, "r3": 0}, played.outcome.messages
     assert [fault.kind for fault in played.scenario.faults] == ["partition", "crash", "clock_step", "sensor_dropout"]
