@@ -26,10 +26,10 @@ check: setup
 	$(BIN)/mypy --strict examples
 	$(BIN)/mypy benchmarks
 
-# Processes and links of real time come after the rest, alone.
+# Processes and links of real time come after the rest. They wait more than they work, so two at a time.
 unit: setup
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -P -m pytest -n 2 --dist loadfile -m "not realtime" tests
-	$(BIN)/python -P -m pytest -m realtime tests
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -P -m pytest -n 2 --dist loadfile -m realtime tests/deploy tests/docs tests/examples
 
 # Ratios against public libraries, speed of fleets, memory; measured, never asserted by tests.
 benchmark: setup
@@ -44,7 +44,7 @@ check-fuzz: setup
 # command goes on where it stopped.
 check-long: setup check-fuzz check-matrix
 	COFIX_THOROUGH=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -P -m pytest -n 2 tests/agent tests/sim tests/network
-	COFIX_THOROUGH=1 $(BIN)/python -P -m pytest tests/deploy/test_process_fleet.py tests/docs tests/examples
+	COFIX_THOROUGH=1 $(BIN)/python -P -m pytest tests/deploy/test_process_fleet.py tests/docs
 	COFIX_INTERLEAVING_DEPTH=4 $(BIN)/python -P -m pytest -s tests/agent/test_three_robots.py
 	OPENBLAS_NUM_THREADS=1 $(BIN)/cofix montecarlo fault-plan --trials 2000 --check --out runs/check-long/field
 	OPENBLAS_NUM_THREADS=1 $(BIN)/cofix montecarlo fault-plan --trials 500 --check --set fault_plan.intensity=storm --out runs/check-long/storm

@@ -132,7 +132,6 @@ class AgentShell:
                 self._on_packet,
             )
             await self._injection.open()
-            self._receive = self._injection.on_packet
         self._transport = ZenohTransport(settings, lambda packet: self._receive(packet))
         await self._transport.start()
         await self._sensors.open()
@@ -194,6 +193,9 @@ class AgentShell:
             self._recording = LiveRecording(Path(config.recording), config, start_ns)
             if begin.again or begin.state is not None:
                 self._recording.begin_life(start_ns, begin.state)
+        if self._injection is not None:
+            # What was heard before had no schedule yet, and nobody to hear it.
+            self._receive = self._injection.on_packet
         self._node = Node(
             begin.settings,
             config.network.settings(config.lateness, config.unsafe.settings()),

@@ -40,11 +40,14 @@ class Transport(Protocol):
 
 
 def free_port(host: str = "127.0.0.1", exclude: Collection[int] = ()) -> int:
-    """A port below the ephemeral range that is free for TCP and UDP on `host` and not in `exclude`."""
+    """A port below the ephemeral range that is free for TCP and UDP on `host` and not in `exclude`.
+
+    It is kept for this process until it ends: whoever asks here is given another one, in other processes too.
+    """
     draw = random.SystemRandom()
     for _ in range(200):
         port = draw.randrange(20_000, EPHEMERAL_FLOOR)
-        if port not in exclude and all(_is_free(host, port, kind) for kind in _KINDS):
+        if port not in exclude and all(_is_free(host, port, kind) for kind in _KINDS) and _reserve(port):
             return port
     raise TransportError(f"no free port on {host}: stop what occupies ports 20000-{EPHEMERAL_FLOOR - 1}")
 
@@ -59,3 +62,21 @@ def _is_free(host: str, port: int, kind: socket.SocketKind) -> bool:
         except OSError:
             return False
         return True
+
+
+_reserved: list[socket.socket] = []
+
+
+def _reserve(port: int) -> bool:
+    """Keep a port that is used later from others who look for one meanwhile; False if somebody has.
+
+    An abstract name belongs to one socket of a network namespace, and ends with its process.
+    """
+    held = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        held.bind(f"\0cofix-port-{port}")
+    except OSError:
+        held.close()
+        return False
+    _reserved.append(held)
+    return True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import re
 from pathlib import Path
 
 import pytest
@@ -95,3 +96,11 @@ def test_no_module_sits_in_a_circle(path: Path) -> None:
         if name not in seen:
             seen.add(name)
             frontier += sorted(graph.get(name, set()))
+
+
+def test_make_test_plays_every_test_of_real_time() -> None:
+    """It looks for them in a few folders, for to collect all tests takes seconds."""
+    (line,) = re.findall(r"-m realtime (.*)", (ROOT / "Makefile").read_text())
+    marked = {path for path in (ROOT / "tests").rglob("test_*.py") if "mark.realtime" in path.read_text()}
+    found = {path for path in marked if any(path.is_relative_to(ROOT / folder) for folder in line.split())}
+    assert marked - found == {Path(__file__)}

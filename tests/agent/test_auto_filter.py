@@ -28,6 +28,7 @@ from tests.agent.team_story import (
     settings,
     unclaimed,
 )
+from tests.sizes import sized
 
 AUTO = replace(LOCALIZATION, form="auto")
 ROUNDING = 2e-2
@@ -186,7 +187,7 @@ def test_too_many_targets_for_factors_mean_no_factors() -> None:
     assert isinstance(item.body, SplitRequest)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+@pytest.mark.parametrize("seed", range(1, sized(2, 4) + 1))
 def test_the_claimed_covariance_covers_the_true_one_in_any_interleaving_of_forms(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

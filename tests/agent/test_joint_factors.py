@@ -49,7 +49,7 @@ from tests.agent.joint_story import (
     settings,
     true_covariance,
 )
-from tests.sizes import every
+from tests.sizes import every, sized
 
 FATES = ("now", "late", "lost", "twice")
 BOTH = [*KNOWN, *(7 + index for index in KNOWN)]
@@ -327,7 +327,7 @@ def snapshots(draw: st.DrawFn) -> JointSnapshot:
     )
 
 
-@limits(max_examples=300, deadline=None)
+@limits(max_examples=sized(100, 300), deadline=None)
 @given(snapshots(), st.sampled_from(["range", "bearing", "vector", "smell"]), st.sampled_from(EPOCHS))
 def test_no_snapshot_stops_the_agent(snapshot: JointSnapshot, kind: str, epoch: Epoch) -> None:
     story = met()

@@ -258,7 +258,7 @@ def test_whatever_arrives_around_a_new_life_claims_bound_the_truth(
 
     Two contacts before the restart, so that the pair is correlated, and one after it.
     """
-    for fates in product(FATES, repeat=3 if first == "both" else 2):
+    for fates in every(3, product(FATES, repeat=3 if first == "both" else 2)):
         for when in ("before", "between", "after"):
             note = f"{first}, {again}, new life of {robot}, told {when}: {' '.join(fates)}"
             story = Story(("now", "now", *fates))

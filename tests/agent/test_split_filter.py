@@ -27,11 +27,12 @@ from tests.agent.team_story import (
     settings,
     unclaimed,
 )
+from tests.sizes import sized
 
 Array = NDArray[np.float64]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+@pytest.mark.parametrize("seed", range(1, sized(2, 4) + 1))
 def test_the_claimed_covariance_covers_the_true_one_in_any_interleaving(seed: int) -> None:
     team, slack = unclaimed(seed)
     applied = 0

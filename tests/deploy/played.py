@@ -73,6 +73,8 @@ class Played:
     """(instant [s], status of every robot) as it went on."""
     t_s: Any
     robots: dict[str, StateTrace]
+    scenario: Scenario
+    """With the faults there were, those by hand too."""
     notes: dict[str, Any] = field(default_factory=dict)
 
     def last(self, robot: str) -> dict[str, Any]:
@@ -171,8 +173,9 @@ def play(
     assert os.environ.get("TMPDIR") == before
     assert not [pid for pid in pids if alive(pid)]
     assert not list(folder.glob("cofix-*")) and not list(folder.rglob("*.sock"))
-    trial = collect(found, world, run_dir, outcome, False, SEED)
-    return Played(outcome, statuses, trial.trace.t_s, dict(trial.trace.robots), live[0].notes)
+    there_was = live[0].launcher.played()
+    trial = collect(there_was, world, run_dir, outcome, False, SEED)
+    return Played(outcome, statuses, trial.trace.t_s, dict(trial.trace.robots), there_was, live[0].notes)
 
 
 async def _begun(live: Live, disturb: Disturb | None) -> None:

@@ -225,7 +225,8 @@ def test_runs_are_compared_on_one_page_that_can_be_written_again(desk: Desk, mon
     assert compared[-1][1].name.startswith("comparison-")
 
 
-def test_a_run_has_a_report_that_can_be_written_again(desk: Desk) -> None:
+def test_a_run_has_a_report_that_can_be_written_again(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sim.plots.DPI", 50)
     short = ["ut-clat", "--duration", "5", "--set", "window_s=[0,5]"]
     status, out, err = desk("run", *short, "--out", "one")
     assert status == 0

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import csv
-import json
-import os
+import math
 import stat
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +16,14 @@ import pytest
 
 from agent.config_file import ConfigError
 from agent.fault_parts import AnyFaultPart, CrashPart
+from agent.settings import NS
+from deploy.evaluate import merge_fates
 from deploy.fault import socket_of, split, wanted
 from deploy.live_faults import LiveFaults
+from sim.metrics import nees
 from sim.scenario import Scenario
 from sim.scenario_file import load
-from sim.store import load_trace
+from tests.deploy.played import SEED, Live, play
 
 pytestmark = pytest.mark.realtime
 
@@ -184,9 +186,9 @@ def test_names_differ_and_a_clock_that_was_set_stays() -> None:
 SCENARIO = """
 version = 1
 name = "trio"
-duration_s = 45.0
+duration_s = 600.0
 step_s = 0.5
-window_s = [5.0, 45.0]
+window_s = [5.0, 600.0]
 
 [localization]
 pair_interval_s = 1.0
@@ -209,60 +211,63 @@ sensors = {{ range = {{ of = ["peers"], sigma_m = 0.1 }}, pose = {{ sigma_m = 0.
 """
 
 
-def test_a_run_that_goes_on_is_broken_and_healed_by_hand(tmp_path: Path) -> None:
-    (tmp_path / "trio.toml").write_text(SCENARIO + "".join(ROBOT.format(k=k) for k in (1, 2, 3)))
-    out = tmp_path / "run"
-    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+def fault(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*COFIX, "fault", *words], capture_output=True, text=True, timeout=120, check=False)
 
-    def fault(*words: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [*COFIX, "fault", *words], capture_output=True, text=True, env=environment, timeout=30, check=False
-        )
 
-    def injected(*words: str) -> str:
-        done = fault(str(out), *words)
+def test_a_run_that_goes_on_is_broken_and_healed_by_hand(short_path: Path) -> None:
+    (short_path / "trio.toml").write_text(SCENARIO + "".join(ROBOT.format(k=k) for k in (1, 2, 3)))
+    out = short_path / "run"
+
+    async def injected(*words: str) -> str:
+        done = await asyncio.to_thread(fault, str(out), *words)
         assert done.returncode == 0, done.stderr
         return done.stdout.partition(":")[0]
 
-    run = subprocess.Popen(
-        [*COFIX, "run", "trio.toml", "--runtime", "processes", "--speed", "3", "--seed", "3", "--json", "--out", "run"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-        cwd=tmp_path,
-    )
-    try:
-        deadline = time.monotonic() + 60.0
-        while not (there := list(tmp_path.glob("cofix-*/faults.sock"))) and time.monotonic() < deadline:
-            time.sleep(0.05)
-        assert stat.S_IMODE(there[0].stat().st_mode) == 0o600
-        cut = injected("partition", "r1,r2", "r3")
-        killed = injected("kill", "r2")
-        injected("clock_step", "r1", "0.3")
-        injected("sensor_dropout", "r3", "range", "--for", "5")
-        wrong = fault("isolate", "r7")
+    async def by_hand(live: Live) -> None:
+        """The run goes on until all is done, however long the commands take."""
+        (there,) = short_path.glob("cofix-*/faults.sock")
+        assert stat.S_IMODE(there.stat().st_mode) == 0o600
+        live.notes["cut"] = cut = await injected("partition", "r1,r2", "r3")
+        live.notes["killed"] = killed = await injected("kill", "r2")
+        since_s = live.t_s
+        await injected("clock_step", "r1", "0.3")
+        await injected("sensor_dropout", "r3", "range", "--for", "5")
+        wrong = await asyncio.to_thread(fault, str(out), "isolate", "r7")
         assert wrong.returncode == 2 and "no robot 'r7'" in wrong.stderr
-        listed = fault(str(out), "list").stdout
-        assert f"on  {cut}:" in listed
-        injected("end", cut)
-        injected("end", killed)
-        stdout, stderr = run.communicate(timeout=90)
-    finally:
-        run.kill()
-        run.wait()
-    assert run.returncode == 0, stderr
-    summary = json.loads(stdout)
-    assert [text.split()[0] for text in summary["faults"]] == ["partition", "crash", "clock_step", "sensor_dropout"]
-    assert summary["exit"] == {"r1": 0, "r2": 0, "r3": 0} and summary["fleet"]["anees"] < 2.0
+        listed = await asyncio.to_thread(fault, str(out), "list")
+        assert f"on  {cut}:" in listed.stdout
+        await live.until(since_s + 4.0)
+        await injected("end", cut)
+        await injected("end", killed)
+
+        def known_until_s() -> float:
+            """How far the second life of r2 has come; minus infinity before it is at work."""
+            t_ns = live.status("r2").get("t_ns") if live.launcher.members["r2"].life == 2 else None
+            return -math.inf if t_ns is None else (t_ns - live.launcher.t0_ns) / NS
+
+        await live.wait(lambda: known_until_s() > since_s, 120.0)
+        back_s = live.t_s
+        await live.wait(lambda: known_until_s() > back_s + 2.0, 120.0)
+        live.notes["end_s"] = known_until_s()
+        live.launcher.interrupt()
+
+    played = play(short_path, load(str(short_path / "trio.toml")), speed=3.0, disturb=by_hand)
+    cut, killed, end_s = (played.notes[name] for name in ("cut", "killed", "end_s"))
+    assert played.outcome.exits == {"r1": 0, "r2": 0, "r3": 0}, played.outcome.messages
+    assert [fault.kind for fault in played.scenario.faults] == ["partition", "crash", "clock_step", "sensor_dropout"]
+    faults = {fault.id: fault for fault in played.scenario.faults}
+    assert faults.keys() == {cut, killed, "clock_step-3", "sensor_dropout-4"}
+    window = (played.t_s >= 5.0) & (played.t_s <= end_s)
+    assert np.nanmean([nees(trace)[window] for trace in played.robots.values()]) < 2.0, f"seed {SEED}"
+    merge_fates(played.scenario, out)
     with (out / "fates.csv").open(newline="") as file:
         lost = {(row["source"], row["destination"]) for row in csv.DictReader(file) if row["cause"] == cut}
     assert lost and all("r3" in link for link in lost)
     # Who was killed was gone for as long as is told, and came back.
-    played = {fault.id: fault for fault in load(str(out / "scenario.toml")).faults}
-    crash, trace = played[killed], load_trace(out).trace
-    assert crash.for_s is not None and played.keys() == {cut, killed, "clock_step-3", "sensor_dropout-4"}
-    known = np.isfinite(trace.robots["r2"].mean).all(axis=1)
-    gone = (trace.t_s > crash.at_s + 1.5) & (trace.t_s < crash.at_s + crash.for_s)
-    assert gone.any() and not known[gone].any() and known[-3:].all()
-    assert not list(tmp_path.glob("cofix-*"))
+    crash = faults[killed]
+    assert crash.for_s is not None
+    known = np.isfinite(played.robots["r2"].mean).all(axis=1)
+    gone = (played.t_s > crash.at_s + 1.5) & (played.t_s < crash.at_s + crash.for_s)
+    back = (played.t_s > end_s - 1.5) & (played.t_s < end_s - 0.5)
+    assert gone.any() and not known[gone].any() and back.any() and known[back].all()

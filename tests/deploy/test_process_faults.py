@@ -93,7 +93,7 @@ state = "lost"
 [[faults]]
 kind = "restart"
 robot = "r4"
-at_s = 20.0
+at_s = 13.0
 
 [[faults]]
 kind = "pause"

@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 
+from deploy.fault import ask, socket_of
+from sim.scenario_file import load
 from sim.store import load_trace
 
 pytestmark = pytest.mark.realtime
@@ -152,14 +154,14 @@ def fates(directory: Path) -> dict[tuple[str, ...], tuple[str, ...]]:
         }
 
 
-def test_processes_agree_with_virtual_time(tmp_path: Path) -> None:
-    run = Run(tmp_path, "processes", "--runtime", "processes", "--speed", "5")
+def test_processes_agree_with_virtual_time(short_path: Path) -> None:
+    run = Run(short_path, "processes", "--runtime", "processes", "--speed", "5")
     members = run.members()
     status, real, said = run.finish()
     assert status == 0, said
     assert real is not None
-    assert_nothing_left(tmp_path, members)
-    status, virtual, said = Run(tmp_path, "virtual", "--no-report").finish()
+    assert_nothing_left(short_path, members)
+    status, virtual, said = Run(short_path, "virtual", "--no-report").finish()
     assert status == 0, said
     assert virtual is not None
     assert real["exit"] == {"r1": 0, "r2": 0}
@@ -167,13 +169,13 @@ def test_processes_agree_with_virtual_time(tmp_path: Path) -> None:
     # Equal noise, equal fates: only scheduling differs. A wide margin, since the machine may be loaded.
     ratio = real["fleet"]["position_rmse_m"] / virtual["fleet"]["position_rmse_m"]
     assert 0.6 < ratio < 1.6, f"seed {SEED}: fleet RMSE is {ratio:.2f} x that of virtual time"
-    ours, theirs = fates(run.directory), fates(tmp_path / "virtual")
+    ours, theirs = fates(run.directory), fates(short_path / "virtual")
     shared = [packet for packet in ours if packet in theirs]
     assert len(shared) > 40
     assert [packet for packet in shared if ours[packet] != theirs[packet]] == []
     lost = [packet for packet in shared if ours[packet][0] == "1"]
     assert 0.1 < len(lost) / len(shared) < 0.5
-    kept = [load_trace(folder) for folder in (run.directory, tmp_path / "virtual")]
+    kept = [load_trace(folder) for folder in (run.directory, short_path / "virtual")]
     measured = [stored.measured for stored in kept if stored is not None]
     # The lower id owns a two-way range; one each step.
     assert [list(found) for found in measured] == [[("r1", "r2")]] * 2
@@ -192,22 +194,26 @@ def test_processes_agree_with_virtual_time(tmp_path: Path) -> None:
     assert replayed.stdout.count("all equal") == 2
 
 
-def test_a_killed_agent_is_told_and_the_others_finish(tmp_path: Path) -> None:
-    run = Run(tmp_path, "killed", "--runtime", "processes", "--speed", "4", "--no-report", "--duration", "25")
+def test_a_killed_agent_is_told_and_the_others_finish(short_path: Path) -> None:
+    run = Run(short_path, "killed", "--runtime", "processes", "--speed", "4", "--no-report", "--duration", "25")
     members = run.members()
     run.wait_until_played()
     os.kill(members["r2"], signal.SIGKILL)
+    assert "error" not in ask(socket_of(run.directory), {"inject": {"kind": "loss", "share": 0.5, "id": "by-hand"}})
     status, summary, said = run.finish()
     assert status == 1
     assert summary is not None
+    # What was done by hand is told, and kept as a schedule.
+    assert summary["faults"][-1].startswith("by-hand")
+    assert [fault.id for fault in load(str(run.directory / "scenario.toml")).faults] == ["by-hand"]
     assert summary["exit"] == {"r1": 0, "r2": -signal.SIGKILL}
     assert "r2 was ended by SIGKILL" in said
     assert summary["robots"]["r1"]["position_rmse_m"] < 1.0
-    assert_nothing_left(tmp_path, members)
+    assert_nothing_left(short_path, members)
 
 
-def test_interrupt_stops_everything(tmp_path: Path) -> None:
-    run = Run(tmp_path, "interrupted", "--runtime", "processes", "--speed", "1")
+def test_interrupt_stops_everything(short_path: Path) -> None:
+    run = Run(short_path, "interrupted", "--runtime", "processes", "--speed", "1")
     members = run.members()
     run.wait_until_played()
     run.process.send_signal(signal.SIGINT)
@@ -215,4 +221,4 @@ def test_interrupt_stops_everything(tmp_path: Path) -> None:
     assert status == 1
     assert summary is None
     assert "interrupted" in said
-    assert_nothing_left(tmp_path, members)
+    assert_nothing_left(short_path, members)

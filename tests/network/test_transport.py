@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import subprocess
+import sys
 
 import pytest
 
@@ -18,6 +20,21 @@ def test_a_free_port_is_free_for_both_protocols_and_below_the_ephemeral_range() 
     for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
         with socket.socket(socket.AF_INET, kind) as probe:
             probe.bind(("127.0.0.1", port))
+
+
+def test_a_port_that_somebody_was_given_is_not_given_to_another_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs that start at the same time choose their ports before they use them."""
+    choose = "from network.transport import free_port; print(free_port(), flush=True); input()"
+    other = subprocess.Popen([sys.executable, "-c", choose], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert other.stdout is not None
+    port = int(other.stdout.readline())
+    monkeypatch.setattr("random.SystemRandom.randrange", lambda *_: port)
+    with pytest.raises(TransportError, match="no free port"):
+        free_port()
+    other.communicate("\n")
+    assert free_port() == port
+    with pytest.raises(TransportError, match="no free port"):
+        free_port()
 
 
 def test_without_a_free_port_the_remedy_is_told() -> None:
