@@ -122,9 +122,15 @@ class Live:
         """Until something is so; how long it took [s of wall time]."""
         begin = time.monotonic()
         while not true():
-            assert time.monotonic() - begin < wall_s, "it did not happen in time"
+            assert time.monotonic() - begin < wall_s, f"it did not happen in time: {self.told()}"
             await asyncio.sleep(0.05)
         return time.monotonic() - begin
+
+    def told(self) -> dict[str, Any]:
+        """Who hears whom, and what was refused or lost, for a failure's reason."""
+        parts = ("peers", "duplicates", "clocks", "rejected", "transport")
+        found = {name: member.status for name, member in self.launcher.members.items() if name != "world"}
+        return {name: {part: status.get(part) for part in parts} for name, status in found.items()}
 
     def pid(self, robot: str) -> int:
         return self.launcher.members[robot].process.pid
