@@ -288,7 +288,9 @@ def test_a_full_disk_while_contacts_rely_on_the_state_file(tmp_path: Path) -> No
         used = live.status("r2")["counters"]["pair.applied_initiator"]
         resource.prlimit(live.pid("r2"), resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
         await live.wait(lambda: {"state.write_failed", "recording.failed"} <= set(live.status("r2")["troubles"]))
-        await live.wait(lambda: live.status("r2")["counters"]["pair.applied_initiator"] >= used + 4)
+        # Before it is killed.
+        more = lambda: live.status("r2")["counters"]["pair.applied_initiator"] >= used + 4
+        await live.wait(more, 13.5 - live.t_s)
         live.notes["status"] = live.status("r2")
         live.notes["files"] = (folder / FILE).exists(), (folder / REFUSED).exists()
         await live.wait(lambda: live.launcher.members["r2"].life == 2)
