@@ -7,9 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from agent.core import Agent, NisSum
+from agent.core import Agent
 from agent.effects import Alarm, Broadcast, Effect, Estimate, Persist, Publish, Send
 from agent.events import ClockJudged, Event, LinkChange, Received, Tick
+from agent.figures import NisSum
 from agent.sensor_input import SensorConfig, SensorError, decode
 from agent.settings import AgentSettings
 from network.endpoint import ClockChange, Delivery, Endpoint, EndpointSettings, PeerChange, PeerDoubled
@@ -56,6 +57,7 @@ class Node:
             robot=settings.robot, boot_id=boot_id, incarnation=incarnation, settings=endpoint, software=software
         )
         self.counters: Counter[str] = Counter()
+        self._now_ns = 0
         self._sensors = sensors or {}
         self._recorder = recorder
 
@@ -79,6 +81,7 @@ class Node:
     def on_packet(self, now_ns: int, packet: Packet) -> Outgoing:
         """A packet from the network."""
         out = Outgoing()
+        self._now_ns = now_ns
         for item in self.endpoint.receive(now_ns, packet):
             if isinstance(item, ClockChange):
                 out.alarms.append(_clock_alarm(item))
@@ -94,6 +97,7 @@ class Node:
     def on_tick(self, now_ns: int) -> Outgoing:
         """Time has passed."""
         out = Outgoing()
+        self._now_ns = now_ns
         packets, changes = self.endpoint.tick(now_ns)
         out.packets.extend(packets)
         for change in changes:
@@ -132,7 +136,7 @@ class Node:
             for peer in peers
             if peer.offset_ns is not None and peer.offset_sigma_ns is not None
         }
-        doubled = [self.robot] if self.endpoint.own_life.doubled(self.agent.now_ns) else []
+        doubled = [self.robot] if self.endpoint.own_life.doubled(self._now_ns) else []
         return {
             "robot": self.robot,
             "incarnation": self.endpoint.incarnation,
