@@ -159,7 +159,7 @@ def test_paused_and_continued(tmp_path: Path) -> None:
 
 @LONG
 def test_stopped_in_good_order_and_started_again(tmp_path: Path) -> None:
-    """What it has kept is what it published last, which is newer than its last contact."""
+    """What it has kept is what it published last, though it had nothing to write down since it was alone."""
 
     async def disturb(live: Live) -> None:
         await live.wait(lambda: live.launcher.members["r4"].gone and live.launcher.members["r4"].exit_code is not None)
@@ -171,8 +171,9 @@ def test_stopped_in_good_order_and_started_again(tmp_path: Path) -> None:
         live.notes["published_ns"] = told[-1].estimate.t_ns
         await gone_and_back(live, "r4")
 
-    fault = 'faults=[{kind = "restart", robot = "r4", at_s = 6.5, for_s = 6.0}]'
-    played = play(tmp_path, scenario(60.0, fault), 2.0, disturb)
+    alone = '{kind = "isolate", robot = "r4", at_s = 3.0, for_s = 9.0}'
+    faults = f'faults=[{alone}, {{kind = "restart", robot = "r4", at_s = 6.5, for_s = 6.0}}]'
+    played = play(tmp_path, scenario(60.0, faults, "state.interval_s=60.0"), 2.0, disturb)
     assert_all_well(played)
     assert played.notes["kept_ns"] == played.notes["published_ns"]
     assert played.last("r4")["state_file"]["state.used"] == 1

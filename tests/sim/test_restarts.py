@@ -51,6 +51,18 @@ def test_nobody_is_overconfident_after_a_crash(form: str, seeds: tuple[int, ...]
     assert np.mean(found) < 1.5 and max(found) < 4.0, f"seeds {seeds}: {found}"
 
 
+def test_nobody_is_overconfident_after_a_name_was_borne_twice() -> None:
+    """q2 is held to be over, goes on in a life that follows, and each of its peers begins anew with it."""
+    seeds, found = range(1, sized(2, 6) + 1), []
+    for seed in seeds:
+        stranger = {"kind": "forge", "claims": "q2", "content": "stranger", "rate_hz": 1.7, "at_s": 12.0, "for_s": 3.0}
+        result = run_trial(story("safe", 35.0, stranger), seed)
+        late = result.trace.t_s > 21.0
+        found += [float(np.nanmean(nees(trace)[late])) for trace in result.trace.robots.values()]
+        assert total(result, "pair.restarts") == 2, f"seed {seed}"
+    assert np.mean(found) < 1.5 and max(found) < 4.0, f"seeds {seeds}: {found}"
+
+
 @pytest.mark.parametrize("state", ["kept", "lost"])
 def test_fifty_starts_in_a_minute_inflate_nobody_further(state: str) -> None:
     crashes = [crash(state, 5.0 + 1.1 * k, 0.4) for k in range(50)]
