@@ -118,9 +118,9 @@ class StateKeeper:
 
     def succeed(self, begin: Start) -> None:
         """Another life begins in the same process: no state of the one before is written from now on."""
-        self._waiting = None
         self._number += 1
         with self._lock:
+            # Of states of the life before that still wait, none is written under the new number.
             self._incarnation, self._written = begin.incarnation, self._number
         if not self._write(self._number, begin.state):
             self._file.refuse()
