@@ -10,6 +10,7 @@ from typing import Any
 from agent.core import Agent
 from agent.effects import Alarm, Broadcast, Effect, Estimate, Persist, Publish, Send
 from agent.events import ClockJudged, Event, LinkChange, Received, Tick
+from agent.figures import NisSum
 from agent.sensor_input import SensorConfig, SensorError, decode
 from agent.settings import AgentSettings
 from network.endpoint import ClockChange, Delivery, Endpoint, EndpointSettings, PeerChange, PeerDoubled
@@ -30,6 +31,8 @@ class Outgoing:
     estimates: list[Estimate] = field(default_factory=list)
     alarms: list[Alarm] = field(default_factory=list)
     persist: Persist | None = None
+    next_life: int | None = None
+    """A new life is due, of this incarnation, see `network.own_life`."""
 
 
 class Node:
@@ -54,6 +57,7 @@ class Node:
             robot=settings.robot, boot_id=boot_id, incarnation=incarnation, settings=endpoint, software=software
         )
         self.counters: Counter[str] = Counter()
+        self._now_ns = 0
         self._sensors = sensors or {}
         self._recorder = recorder
 
@@ -77,6 +81,7 @@ class Node:
     def on_packet(self, now_ns: int, packet: Packet) -> Outgoing:
         """A packet from the network."""
         out = Outgoing()
+        self._now_ns = now_ns
         for item in self.endpoint.receive(now_ns, packet):
             if isinstance(item, ClockChange):
                 out.alarms.append(_clock_alarm(item))
@@ -92,13 +97,28 @@ class Node:
     def on_tick(self, now_ns: int) -> Outgoing:
         """Time has passed."""
         out = Outgoing()
+        self._now_ns = now_ns
         packets, changes = self.endpoint.tick(now_ns)
         out.packets.extend(packets)
         for change in changes:
             self._handle(_link_change(now_ns, change), out)
         if self.agent.next_deadline_ns() <= now_ns:
             self._handle(Tick(now_ns), out)
+        out.next_life = self.endpoint.own_life.next_incarnation(now_ns)
         return out
+
+    def count_on(self, before: Node) -> None:
+        """Add what was counted in the life before, in the same process."""
+        for mine, theirs in (
+            (self.counters, before.counters),
+            (self.agent.counters, before.agent.counters),
+            (self.endpoint.counters, before.endpoint.counters),
+        ):
+            mine.update(theirs)
+        for kind, entry in before.agent.nis.items():
+            total = self.agent.nis.setdefault(kind, NisSum())
+            total.total += entry.total
+            total.count += entry.count
 
     def next_deadline_ns(self) -> int:
         return min(self.endpoint.next_deadline_ns(), self.agent.next_deadline_ns())
@@ -116,12 +136,14 @@ class Node:
             for peer in peers
             if peer.offset_ns is not None and peer.offset_sigma_ns is not None
         }
+        doubled = [self.robot] if self.endpoint.own_life.doubled(self._now_ns) else []
         return {
             "robot": self.robot,
+            "incarnation": self.endpoint.incarnation,
             **self.agent.status(),
             "peers": {peer.peer: peer.up for peer in peers},
             "clocks": clocks,
-            "duplicates": [peer.peer for peer in peers if peer.doubled],
+            "duplicates": sorted(doubled + [peer.peer for peer in peers if peer.doubled]),
             "rejected": rejected(self),
         }
 
@@ -153,7 +175,7 @@ class Node:
             self.counters["send.degenerate"] += 1
 
 
-DOUBLED = "two processes send under this id; stop one of them (the earlier one, to stay, needs an empty state_dir)"
+DOUBLED = "two processes send under this id; stop one of them"
 CLOCK_REASONS = {
     "steps": "it is set again and again",
     "offset": "it is off by far more than lateness.clock_sigma_s allows; set the clock, or enlarge that",

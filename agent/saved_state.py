@@ -153,6 +153,25 @@ def begun_again(settings: AgentSettings) -> AgentSettings:
     return replace(settings, cov=2.0 * settings.cov, targets=targets)
 
 
+def given_up(settings: AgentSettings, payload: bytes) -> bytes | None:
+    """A state to begin a new life with in which nothing is left that peers may rely on; None: there is none.
+
+    As in `begun_again`: peers double their covariance when they see the new life, and this side is doubled here, which
+    bounds the joint covariance whatever the correlation was. Without factors all of the belief counts as shared.
+    Form `joint` begins with its survey again.
+    """
+    restored = decode(payload, settings)
+    if isinstance(restored.saved, SavedSplit):
+        return payload
+    if settings.localization.form == "joint":
+        return None
+    state = restored.saved.state
+    cov = state.cov if settings.unsafe.trust_restarts else 2.0 * state.cov
+    stack = state.stack.changed({}, tuple(state.stack.blocks))
+    alone = RobotState(state.t_ns, state.mean, cov, stack, {}, state.targets)
+    return encode(restored.settings(settings), SavedFactors(alone), restored.verdicts)
+
+
 # -- writing --------------------------------------------------------------------------------------------------
 
 

@@ -37,7 +37,7 @@ from agent.publications import Publications
 from agent.sensor_socket import SensorSocket
 from agent.settings import nanoseconds
 from agent.state_file import StateFile
-from agent.state_keeper import Start, StateKeeper, start
+from agent.state_keeper import Start, StateKeeper, start, succeed
 from network.messages import Channel, Packet
 from network.zenoh_transport import ZenohSettings, ZenohTransport
 
@@ -196,7 +196,17 @@ class AgentShell:
         if self._injection is not None:
             # What was heard before had no schedule yet, and nobody to hear it.
             self._receive = self._injection.on_packet
-        self._node = Node(
+        self._node = self._living(begin)
+        if config.mavlink is not None:
+            self._reader = AutopilotReader(config.mavlink.settings(list(config.origin)))
+            self._mavlink = MavlinkLink(config.mavlink.endpoint, self._reader, self._clock, self.on_event)
+            await self._mavlink.start()
+            await self._reached(config.mavlink.endpoint)
+        self._arm()
+
+    def _living(self, begin: Start) -> Node:
+        config = self.config
+        return Node(
             begin.settings,
             config.network.settings(config.lateness, config.unsafe.settings()),
             boot_id=self._boot_id,
@@ -206,12 +216,20 @@ class AgentShell:
             recorder=self._recording.record if self._recording is not None else None,
             state=begin.state,
         )
-        if config.mavlink is not None:
-            self._reader = AutopilotReader(config.mavlink.settings(list(config.origin)))
-            self._mavlink = MavlinkLink(config.mavlink.endpoint, self._reader, self._clock, self.on_event)
-            await self._mavlink.start()
-            await self._reached(config.mavlink.endpoint)
-        self._arm()
+
+    def _succeed(self, incarnation: int) -> None:
+        """Go on in a new life."""
+        assert self._node is not None and self._keeper is not None
+        before = self._node
+        begin = succeed(self.config.settings(self._start_ns), before.agent.saved(), incarnation)
+        self._boot_id = secrets.randbits(53)
+        self._keeper.succeed(begin)
+        if self._recording is not None:
+            self._recording.begin_life(self._clock.now_ns(), begin.state)
+        self._node = self._living(begin)
+        self._node.count_on(before)
+        self._node.endpoint.counters["lives_given_up"] += 1
+        log.warning("new_life: peers hold the last one to be over; a new one begins, no correlation is kept")
 
     def _restored(self, start_ns: int) -> Start:
         """How to begin, with the state file if it can be used; the life has begun on disk when this returns."""
@@ -283,6 +301,8 @@ class AgentShell:
                 self.counters["state.held_back"] += 1
         for alarm in (*out.alarms, *self._troubles()):
             self._publications.warn(alarm)
+        if out.next_life is not None:
+            self._succeed(out.next_life)
         if out.estimates and (estimate := self._publications.estimate(out.estimates[-1])) is not None:
             self._transport.publish(Channel.ESTIMATE, estimate)
         self._arm()

@@ -16,7 +16,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from agent.effects import Alarm, Persist
-from agent.saved_state import begun_again, decode
+from agent.saved_state import begun_again, decode, given_up
 from agent.settings import NS, AgentSettings
 from agent.state_fields import StateError
 from agent.state_file import Found, StateFile, next_incarnation
@@ -68,6 +68,15 @@ def start(
     return Start(begun_again(settings) if again else settings, incarnation, None, again), reason
 
 
+def succeed(settings: AgentSettings, state: bytes | None, incarnation: int) -> Start:
+    """How a process goes on whose life its peers hold to be over: in a new one, correlations given up.
+
+    `settings` are those of its first start, `state` what it knows now.
+    """
+    kept = None if state is None else given_up(settings, state)
+    return Start(begun_again(settings) if kept is None else settings, incarnation, kept, kept is None)
+
+
 class StateKeeper:
     """Writes the states of one life. Writes that nothing waits for are done beside the event loop, one at a time."""
 
@@ -106,6 +115,15 @@ class StateKeeper:
             self._counters["state.used"] += 1
         elif not self._write(0, None):
             log.warning("the state file cannot be written: the next start will not know of this one")
+
+    def succeed(self, begin: Start) -> None:
+        """Another life begins in the same process: no state of the one before is written from now on."""
+        self._number += 1
+        with self._lock:
+            # Of states of the life before that still wait, none is written under the new number.
+            self._incarnation, self._written = begin.incarnation, self._number
+        if not self._write(self._number, begin.state):
+            self._file.refuse()
 
     def _write(self, number: int, payload: bytes | None) -> bool:
         with self._lock:

@@ -13,10 +13,10 @@ each refusal is counted as `rejected.<reason>`. Reasons besides those of `networ
     duplicate          accepted already
     too_old_seq        so far behind that it cannot be told from a duplicate
     too_many_peers     the peer table is full
-    duplicate_robot    two processes send under the sender's id
+    duplicate_robot    two processes send under the sender's id, or under ours
     clock_unusable     the sender's clock is beyond repair: its stamps mean nothing
 
-`received = delivered + hellos + sum of rejected.*` holds at all times.
+`received = delivered + hellos + sum of rejected.*` holds at all times; what peers say of lives counts as a hello.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from network.messages import (
     ClockEcho,
     Header,
     Hello,
+    LifeNotice,
     Message,
     Packet,
     PairReply,
@@ -40,6 +41,7 @@ from network.messages import (
     SplitRequest,
     StartRequest,
 )
+from network.own_life import OwnLife
 from network.peers import MAX_PEERS, Peer, PeerTable
 from network.wire import OversizeError, decode, encode
 from network.wire_fields import MAX_INT, WireError, valid_id
@@ -119,7 +121,7 @@ class ClockChange:
 
 @dataclass(frozen=True, slots=True)
 class PeerDoubled:
-    """Two processes are seen to send under a peer's id."""
+    """Two processes are seen to send under a peer's id, or under the own one."""
 
     peer: str
 
@@ -176,6 +178,7 @@ class Endpoint:
         self._echo_turn = 0
         self._clock_changes: list[ClockChange] = []
         self._doubled: list[PeerDoubled] = []
+        self.own_life = OwnLife(boot_id, incarnation, settings.silent_after_ns)
         encode(self._header(0, 0, 0), Hello(software))
 
     # --- out ----------------------------------------------------------------------------------------------
@@ -222,6 +225,8 @@ class Endpoint:
         # A due time beyond one period means that our own clock was set back.
         if due_ns is None or now_ns >= due_ns or due_ns - now_ns > period_ns:
             packets.append(self.broadcast(now_ns, Channel.HELLO, now_ns, Hello(self.software, self._echoes())))
+            told = ((peer.robot, notice) for peer in self._table.sorted() for notice in peer.notices())
+            packets += [self.send(now_ns, peer, now_ns, notice) for peer, notice in told]
             on_time = due_ns is not None and 0 <= now_ns - due_ns < period_ns
             self._hello_due_ns = period_ns + (due_ns if on_time and due_ns is not None else now_ns)
         changes = [_change(peer) for peer in self._table.silence(now_ns)]
@@ -249,8 +254,7 @@ class Endpoint:
         """What a packet means to the layer above: nothing, a change of its sender, a message, or both."""
         self.counters["received"] += 1
         self.counters["received_bytes"] += len(packet.payload)
-        self._clock_changes = []
-        self._doubled = []
+        self._clock_changes, self._doubled = [], []
         try:
             return [*self._receive(now_ns, packet), *self._clock_changes]
         except WireError as error:
@@ -260,14 +264,14 @@ class Endpoint:
                 peer.counters["rejected"] += 1
             return [*self._clock_changes, *self._doubled]
 
-    def _receive(self, now_ns: int, packet: Packet) -> list[Delivery | PeerChange]:
+    def _receive(self, now_ns: int, packet: Packet) -> list[Delivery | PeerChange | PeerDoubled]:
         message = self._admissible(packet)
         header, body = message.header, message.body
         fresh: Hello | None = None
         peer = self._table.get(header.source)
         if peer is not None:
             refusal = peer.refusal(header.t_send_ns, header.boot_id, header.incarnation, packet.channel, header.seq)
-            if refusal == "old_life" and peer.outlived(now_ns, header.t_send_ns):
+            if refusal == "old_life" and peer.outlived(now_ns, header.t_send_ns, header.boot_id):
                 self.counters["doubled"] += 1
                 self._doubled.append(PeerDoubled(peer.robot))
             if refusal is not None and not (self.settings.accept_duplicates and refusal in REPEATED):
@@ -280,10 +284,11 @@ class Endpoint:
         if not isinstance(body, Hello) or self._knows_clock(now_ns, header, peer):
             self._check_age(now_ns, header, peer)
         doubled = peer is not None and peer.doubled(now_ns, self.settings.silent_after_ns)
-        if doubled and not isinstance(body, Hello):
-            raise WireError("duplicate_robot")
-        if peer is not None and peer.clock_unusable is not None and not isinstance(body, Hello):
-            raise WireError("clock_unusable")
+        if not isinstance(body, Hello | LifeNotice):
+            if doubled or self.own_life.doubled(now_ns):
+                raise WireError("duplicate_robot")
+            if peer is not None and peer.clock_unusable is not None:
+                raise WireError("clock_unusable")
         if peer is None:
             peer = self._table.admit(now_ns, header.source, header.boot_id, header.incarnation)
             if peer is None:
@@ -291,17 +296,19 @@ class Endpoint:
             if (gone := self._table.forgotten) is not None and gone.clock_unusable is not None:
                 self._clock_changes.append(ClockChange(gone.robot, None))
         unusable = peer.clock_unusable
-        events: list[Delivery | PeerChange] = []
+        events: list[Delivery | PeerChange | PeerDoubled] = []
         if peer.accept(now_ns, header.t_send_ns, header.boot_id, header.incarnation, packet.channel, header.seq):
             events.append(_change(peer))
             if unusable is not None and peer.clock_unusable is None:
                 # A new life has a clock that nobody has judged yet.
                 self.counters["clock_usable"] += 1
                 self._clock_changes.append(ClockChange(peer.robot, None))
-        if isinstance(body, Hello):
+        if isinstance(body, Hello | LifeNotice):
             self.counters["hellos"] += 1
             if fresh is not None:
                 self._take_echo(now_ns, header, fresh, peer)
+            if isinstance(body, LifeNotice) and self.own_life.told(now_ns, peer.robot, body):
+                events.append(PeerDoubled(self.robot))
         else:
             self.counters["delivered"] += 1
             known = peer.clock.at(now_ns)
@@ -343,7 +350,8 @@ class Endpoint:
         return peer.clock.at(now_ns) is not None
 
     def _take_echo(self, now_ns: int, header: Header, hello: Hello, peer: Peer) -> None:
-        for echo in hello.echoes:
+        # Those of stamps that another process of our id has sent are of its clock.
+        for echo in () if self.own_life.doubled(now_ns) else hello.echoes:
             if echo.peer == self.robot and not peer.clock.add(echo.t1_ns, echo.t2_ns, header.t_send_ns, now_ns):
                 self.counters["clock_refused"] += 1
                 peer.counters["clock_refused"] += 1
@@ -387,6 +395,6 @@ def _belongs(body: Body, channel: str) -> bool:
     """Whether a body of this type may travel on this channel."""
     if isinstance(body, Hello):
         return channel == Channel.HELLO
-    if isinstance(body, PairRequest | PairReply | SplitRequest | SplitReply | StartRequest):
+    if isinstance(body, LifeNotice | PairRequest | PairReply | SplitRequest | SplitReply | StartRequest):
         return channel == Channel.PAIR
     return channel == Channel.BELIEF

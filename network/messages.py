@@ -104,6 +104,20 @@ class Hello:
     echoes: tuple[ClockEcho, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class LifeNotice:
+    """To one of two processes that send under one id; it is directed to that robot, so both are told.
+
+    boot_id      of the process that is meant
+    incarnation  of the life that the sender goes on with
+    over         the life of the process that is meant is refused, and the one the sender goes on with is silent
+    """
+
+    boot_id: int
+    incarnation: int
+    over: bool
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Belief:
     """A Gaussian over a state of `model`: mean (n,), covariance (n, n)."""
@@ -322,7 +336,7 @@ class TeamReport:
     measurements: tuple[RawMeasurement, ...] = ()
 
 
-Body = Hello | PairRequest | PairReply | SplitRequest | SplitReply | StartRequest | TeamReport
+Body = Hello | LifeNotice | PairRequest | PairReply | SplitRequest | SplitReply | StartRequest | TeamReport
 
 
 @dataclass(frozen=True, slots=True, eq=False)

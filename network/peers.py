@@ -1,10 +1,11 @@
 """Who is out there: duplicates refused, lives told apart, silence noticed.
 
-A life of a robot is a pair (incarnation, boot id). A new life has a higher incarnation, or the same one, a
-boot id not superseded before, and was sent later than everything heard of the present life: without the last
-condition a straggler of a boot that ended before we first listened would supersede the living one for good.
+A life of a robot is a pair (incarnation, boot id). A new life has another boot id, not superseded before, and a higher
+incarnation, or the same one if it was sent later than everything heard of the present life: without the last condition
+a straggler of a boot that ended before we first listened would supersede the living one for good.
 Messages of earlier lives are refused. An earlier life that goes on sending after the next has begun means that two
-processes bear one id: which of them is the robot nobody can know, so neither is believed until one is silent.
+processes bear one id: which of them is the robot nobody can know, so neither is believed until one is silent. Both are
+told. If it is the present life that has fallen silent, the other one begins a new life (`network.own_life`).
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from __future__ import annotations
 from collections import Counter, deque
 
 from network.clock import PeerClock
+from network.messages import LifeNotice
 
 WINDOW = 1024
 DOUBLED_AFTER = 3
-"""So many messages, sent by a former life after the present one has begun, are no stragglers."""
+"""So many messages on end, sent by one former boot after the present life has begun, are no stragglers."""
 MAX_PEERS = 64
 MAX_BOOT_IDS = 16
 """Superseded boot ids remembered per peer; sixteen restarts outlast every message still under way."""
@@ -67,6 +69,8 @@ class Peer:
         self._began_ns: int | None = None
         self._outlived = 0
         self.doubled_ns: int | None = None
+        self._other: int | None = None
+        self._other_heard = False
         self.clock = PeerClock()
         self.clock_unusable: str | None = None
         self.counters: Counter[str] = Counter()
@@ -79,10 +83,11 @@ class Peer:
 
     def is_old_life(self, boot_id: int, incarnation: int, t_send_ns: int) -> bool:
         """Whether a message of this life comes from before the present one."""
+        if boot_id == self.boot_id:
+            # A boot has one incarnation; another one is damage.
+            return incarnation != self.incarnation
         if incarnation != self.incarnation:
             return incarnation < self.incarnation or boot_id in self._superseded
-        if boot_id == self.boot_id:
-            return False
         return boot_id in self._superseded or t_send_ns <= self._latest_sent_ns
 
     def refusal(self, t_send_ns: int, boot_id: int, incarnation: int, channel: str, seq: int) -> str | None:
@@ -94,15 +99,25 @@ class Peer:
             return None
         return window.refusal(seq)
 
-    def outlived(self, now_ns: int, t_send_ns: int) -> bool:
+    def outlived(self, now_ns: int, t_send_ns: int, boot_id: int) -> bool:
         """Take a message of a former life; True if by it two processes are seen to bear this robot's id."""
-        if self._began_ns is None or t_send_ns <= self._began_ns:
+        if self._began_ns is None or t_send_ns <= self._began_ns or boot_id == self.boot_id:
             return False
-        self._outlived += 1
+        # Damaged messages are of another boot each.
+        self._outlived = self._outlived + 1 if boot_id == self._other else 1
+        self._other = boot_id
         if self._outlived < DOUBLED_AFTER:
             return False
-        first, self.doubled_ns = self.doubled_ns is None, now_ns
+        first, self.doubled_ns, self._other_heard = self.doubled_ns is None, now_ns, True
         return first
+
+    def notices(self) -> list[LifeNotice]:
+        """What to tell the processes that bear this robot's id, once the former one has been heard again."""
+        heard, self._other_heard = self._other_heard, False
+        if self._other is None or not heard:
+            return []
+        told = [LifeNotice(self._other, self.incarnation, not self.up)]
+        return [*told, LifeNotice(self.boot_id, self.incarnation, False)] if self.up else told
 
     def doubled(self, now_ns: int, silent_after_ns: int) -> bool:
         """Whether two processes bear this robot's id: until the former one is silent for `silent_after_ns`."""
@@ -114,15 +129,18 @@ class Peer:
         """Record a message that was not refused; True if the peer came up or began a new life with it."""
         changed = not self.up
         if self.is_new_life(boot_id, incarnation):
-            if boot_id != self.boot_id:
-                self._superseded.append(self.boot_id)
+            self._superseded.append(self.boot_id)
             self.boot_id, self.incarnation = boot_id, incarnation
             self._windows.clear()
             self._latest_sent_ns = -1
-            self._began_ns, self._outlived = t_send_ns, 0
+            self._began_ns = t_send_ns
+            if boot_id == self._other:
+                self._outlived, self._other_heard = 0, False
             self.clock, self.clock_unusable = PeerClock(), None
             self.counters["lives"] += 1
             changed = True
+        if self._began_ns is None:
+            self._began_ns = t_send_ns
         self._windows.setdefault(channel, DuplicateWindow()).record(seq)
         if self.counters["accepted"]:
             self.silence_max_ns = max(self.silence_max_ns, now_ns - self.heard_ns)

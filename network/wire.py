@@ -27,6 +27,7 @@ from network.messages import (
     Header,
     Hello,
     JointSnapshot,
+    LifeNotice,
     Measurement,
     Message,
     PairReply,
@@ -60,7 +61,7 @@ from network.wire_snapshots import (
 from network.wire_team import pack_report, read_report
 
 _HELLO, _PAIR_REQUEST, _PAIR_REPLY, _SPLIT_REQUEST, _SPLIT_REPLY, _TEAM_REPORT = 1, 2, 3, 4, 5, 6
-_JOINT_REQUEST, _JOINT_REPLY, _START_REQUEST = 7, 8, 9
+_JOINT_REQUEST, _JOINT_REPLY, _START_REQUEST, _LIFE_NOTICE = 7, 8, 9, 10
 _HEADER_BYTES = 3 + 25 + 5 * 9 + 1
 """Upper bound of what surrounds a body: array marks, schema, longest source, five integers, kind."""
 
@@ -143,6 +144,8 @@ def _pack_body(body: Body) -> tuple[int, tuple[Any, ...]]:
         return _TEAM_REPORT, pack_report(body)
     if isinstance(body, StartRequest):
         return _START_REQUEST, (pack_epoch(body.epoch),)
+    if isinstance(body, LifeNotice):
+        return _LIFE_NOTICE, (body.boot_id, body.incarnation, body.over)
     raise TypeError(f"{type(body).__name__} is not a message body")
 
 
@@ -279,6 +282,13 @@ def _start_request(raw: Any, header: Header) -> StartRequest:
     return StartRequest(epoch)
 
 
+def _life_notice(raw: Any, header: Header) -> LifeNotice:
+    boot_id, incarnation, over = read_fields(raw, 3)
+    if type(over) is not bool:
+        raise WireError("wrong_type")
+    return LifeNotice(read_integer(boot_id), read_integer(incarnation), over)
+
+
 _STATUSES = frozenset(int(status) for status in ReplyStatus)
 _BODIES: dict[int, Callable[[Any, Header], Body]] = {
     _HELLO: _hello,
@@ -290,4 +300,5 @@ _BODIES: dict[int, Callable[[Any, Header], Body]] = {
     _JOINT_REQUEST: _joint_request,
     _JOINT_REPLY: _joint_reply,
     _START_REQUEST: _start_request,
+    _LIFE_NOTICE: _life_notice,
 }

@@ -281,6 +281,9 @@ class VirtualEngine:
             self._processes[node.robot].keep(out.persist)
         for packet in out.packets:
             self._transmit(packet)
+        if out.next_life is not None:
+            self._processes[node.robot].succeed(self._now, out.next_life)
+            self._applied.pop(node.robot, None)
         self._arm(node.robot)
 
     def _transmit(self, packet: Packet) -> None:

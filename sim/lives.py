@@ -15,7 +15,7 @@ from agent.figures import NisSum
 from agent.node import Node, Recorder, rejected
 from agent.settings import nanoseconds
 from agent.state_file import Found
-from agent.state_keeper import start
+from agent.state_keeper import Start, start, succeed
 
 SOFTWARE = "cofix-0.1.0"
 
@@ -65,6 +65,18 @@ class Process:
             self._file = Found(self._file.incarnation)
         now_ns, max_age_ns = self.clock.local_ns(t_ns), nanoseconds(self._config.state.max_age_s)
         begin, refused = start(self._file, self._config.settings(0), now_ns, max_age_ns, 0, 0, 1)
+        self._live(begin, now_ns)
+        if refused is not None and self.node is not None:
+            self.node.counters[f"state.refused_{refused}"] += 1
+
+    def succeed(self, t_ns: int, incarnation: int) -> None:
+        """Go on in a new life of this incarnation, see `network.own_life`."""
+        if self.node is not None:
+            self._past.append(self.node)
+            begin = succeed(self._config.settings(0), self.node.agent.saved(), incarnation)
+            self._live(begin, self.clock.local_ns(t_ns))
+
+    def _live(self, begin: Start, now_ns: int) -> None:
         self._file = Found(begin.incarnation, begin.state)
         if self._lives and self._life_sink is not None:
             self._life_sink(self.robot, now_ns, begin.state)
@@ -81,8 +93,6 @@ class Process:
             recorder=self._recorder,
             state=begin.state,
         )
-        if refused is not None:
-            self.node.counters[f"state.refused_{refused}"] += 1
 
     def keep(self, persist: Persist) -> None:
         """Write the state file."""

@@ -19,7 +19,7 @@ from agent.node import Node, Outgoing, rejected
 from agent.sensor_input import ABSOLUTE_KINDS, SIZES, SensorConfig, encode
 from agent.settings import AgentSettings
 from network.endpoint import EndpointSettings
-from network.messages import Channel, Packet
+from network.messages import Channel, LifeNotice, Packet
 from network.wire import OversizeError
 
 S = 1_000_000_000
@@ -86,6 +86,36 @@ def test_hearing_a_peer_for_the_first_time_is_an_event_of_the_core() -> None:
     one.on_packet(1, hello)
     ((event, _),) = seen
     assert event == LinkChange(1, "r2", True, 1, 7)
+
+
+def test_who_is_told_that_its_life_is_over_says_so_and_asks_for_another() -> None:
+    one, other = introduced()
+    last_ns = 9 * S
+    for t_ns in range(S, last_ns + 1, S):
+        one.on_tick(t_ns)
+    out = one.on_packet(last_ns, other.endpoint.send(last_ns, "r1", last_ns, LifeNotice(7, 4, True)))
+    assert [alarm.reason for alarm in out.alarms] == ["duplicate_robot"] and "r1: " in out.alarms[0].detail
+    assert one.status()["duplicates"] == ["r1"] and one.status()["incarnation"] == 1
+    assert one.on_tick(last_ns + 1).next_life is None
+    assert one.on_tick(11 * S).next_life == 5
+    assert one.on_tick(13 * S).next_life is None and one.status()["duplicates"] == []
+
+
+def test_a_life_that_follows_counts_on() -> None:
+    one, other = introduced()
+    for robot in (one, other):
+        robot.on_sensor(S, moved(0, S))
+    (request,) = one.on_sensor(S, ranged(S)).packets
+    (reply,) = other.on_packet(S, request).packets
+    one.on_packet(S, reply)
+    after = node("r1")
+    after.count_on(one)
+    after.count_on(one)
+    assert after.agent.counters["pair.applied_initiator"] == 2 * one.agent.counters["pair.applied_initiator"] == 2
+    assert after.endpoint.counters["received"] == 2 * one.endpoint.counters["received"] > 0
+    assert {kind: entry.count for kind, entry in after.agent.nis.items()} == {
+        kind: 2 * entry.count for kind, entry in one.agent.nis.items()
+    } != {}
 
 
 def test_a_peer_that_falls_silent_is_an_event_of_the_core() -> None:

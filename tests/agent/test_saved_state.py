@@ -19,7 +19,7 @@ from agent.saved_state import FORMAT, begun_again, decode
 from agent.settings import NS, AgentSettings, LocalizationSettings
 from agent.state_fields import StateError
 from agent.state_file import Found
-from agent.state_keeper import start
+from agent.state_keeper import start, succeed
 from network.messages import Header, Message
 from tests.agent.team_story import DELTA, NOISE, PLACES, TARGET, Team, settings
 
@@ -284,6 +284,45 @@ def test_without_factors_a_survey_that_peers_may_know_of_is_shared(form: str) ->
     state = getattr(agent.filter, "active", agent.filter).state
     assert not state.split.private.any()
     assert agent.status()["form"] == "split_joint"
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_life_that_follows_in_the_same_process_keeps_no_correlation(form: str) -> None:
+    """Factors: twice the covariance, and no pair; without: all of it shared; form `joint`: the survey."""
+    team, rng = driven(form)
+    agent = team.agents["r1"]
+    before, begin = agent.estimate(), succeed(team.settings["r1"], agent.saved(), 9)
+    assert before is not None and begin.incarnation == 9
+    after = Agent(begin.settings, begin.state)
+    now = after.estimate()
+    assert now is not None
+    if form == "joint":
+        assert begin.state is None and begin.again
+        np.testing.assert_array_equal(now.cov, 2.0 * team.settings["r1"].cov)
+    elif form in FACTORS:
+        assert after.filter.contacts() == {}
+        assert agent.filter.contacts() != {}
+        np.testing.assert_array_equal(now.mean, before.mean)
+        np.testing.assert_allclose(now.cov, 2.0 * before.cov)
+    else:
+        assert not getattr(after.filter, "active", after.filter).state.split.private.any()
+        np.testing.assert_array_equal(now.cov, before.cov)
+    # Its peers see the new life, and all go on.
+    team.agents["r1"] = after
+    for other in team.agents:
+        if other != "r1":
+            team.handle("r1", LinkChange(team.now_ns, other, True, 1, 1))
+            team.handle(other, LinkChange(team.now_ns, "r1", True, 9, 2))
+    for _ in range(6):
+        team.second(rng)
+    assert any(after.filter.contacts().values())
+
+
+def test_who_has_no_state_follows_with_its_first_start() -> None:
+    own = found()[1]
+    begin = succeed(own, None, 5)
+    assert (begin.state, begin.again, begin.incarnation) == (None, True, 5)
+    np.testing.assert_array_equal(begin.settings.cov, begun_again(own).cov)
 
 
 def test_states_are_of_a_size_that_a_small_disk_takes() -> None:

@@ -9,15 +9,18 @@ import stat
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from agent.effects import Alarm, Persist
+from agent.settings import AgentSettings
 from agent.state_fields import StateError
 from agent.state_file import FILE, MAGIC, REFUSED, Found, StateFile, next_incarnation, pack, unpack
-from agent.state_keeper import StateKeeper
+from agent.state_keeper import Start, StateKeeper
 
 NOW = 1_700_000_000_000_000_000
 STATE = bytes(range(200))
+SETTINGS = AgentSettings("r1", 0, np.zeros(3), np.eye(3))
 
 
 def test_what_was_written_is_found_and_only_the_robot_may_read_it(tmp_path: Path) -> None:
@@ -157,6 +160,27 @@ def test_states_beside_the_loop_do_not_undo_newer_ones(tmp_path: Path) -> None:
 
     asyncio.run(story())
     assert StateFile(tmp_path, "r1").read() == Found(7, b"last")
+
+
+def test_a_life_that_follows_leaves_nothing_of_the_one_before(tmp_path: Path) -> None:
+    async def story() -> None:
+        keeper = StateKeeper(StateFile(tmp_path, "r1"), 7, Counter())
+        keeper.keep(Persist(b"told", ahead=True))
+        keeper.keep(Persist(b"of the life before"))
+        keeper.succeed(Start(SETTINGS, 9, b"alone"))
+        await keeper.close(None)
+        assert StateFile(tmp_path, "r1").read() == Found(9, b"alone")
+        keeper.keep(Persist(b"later"))
+        await keeper.close(None)
+
+    asyncio.run(story())
+    assert StateFile(tmp_path, "r1").read() == Found(9, b"later")
+
+
+def test_a_life_that_follows_without_room_leaves_no_state_of_the_one_before(tmp_path: Path, full_disk: None) -> None:
+    (tmp_path / FILE).write_bytes(pack("r1", 7, STATE))
+    StateKeeper(StateFile(tmp_path, "r1"), 7, Counter()).succeed(Start(SETTINGS, 9, b"alone"))
+    assert StateFile(tmp_path, "r1").read() == Found(7), "the next start begins a new life"
 
 
 def test_no_older_state_follows_one_that_could_not_be_written(

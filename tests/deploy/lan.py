@@ -85,13 +85,18 @@ class Lan:
         self._remove()
 
     def _remove(self) -> None:
-        for name in namespaces():
-            if name.startswith(f"{self._prefix}-"):
-                self.left += [int(pid) for pid in run("ip", "netns", "pids", name).split()]
-                for pid in self.left:
-                    with suppress(ProcessLookupError):
-                        os.kill(pid, signal.SIGKILL)
-                run("ip", "netns", "del", name)
+        for name in self.namespaces():
+            self.left += [int(pid) for pid in run("ip", "netns", "pids", name).split()]
+            for pid in self.left:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            run("ip", "netns", "del", name)
+
+    def namespaces(self) -> list[str]:
+        """Namespaces of this network that there are; others may run beside it."""
+        folder = Path("/run/netns")
+        found = folder.iterdir() if folder.exists() else ()
+        return sorted(path.name for path in found if path.name.startswith(f"{self._prefix}-"))
 
     @staticmethod
     def _port(robot: str) -> str:
@@ -133,9 +138,3 @@ class Lan:
             run(*inside, "nft", "delete table inet cut")
         else:
             run(*inside, "iptables", "-D", "INPUT", "-i", "eth0", "-j", "DROP")
-
-
-def namespaces() -> list[str]:
-    """Named network namespaces there are."""
-    folder = Path("/run/netns")
-    return sorted(path.name for path in folder.iterdir()) if folder.exists() else []

@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,7 @@ class Played:
     scenario: Scenario
     """With the faults there were, those by hand too."""
     notes: dict[str, Any] = field(default_factory=dict)
+    ended_by_scene: bool = False
 
     def last(self, robot: str) -> dict[str, Any]:
         """The last status of a robot."""
@@ -102,6 +103,14 @@ class Live:
     def __init__(self, launcher: Launcher) -> None:
         self.launcher = launcher
         self.notes: dict[str, Any] = {}
+        self.ended_s: float | None = None
+        """When the scene ended the run [s]."""
+
+    async def end(self, after_s: float = 3.0) -> None:
+        """All has been seen: end the run in `after_s` of its time, in which all are judged still."""
+        await self.until(self.t_s + after_s)
+        self.ended_s = self.t_s
+        self.launcher.interrupt()
 
     @property
     def t_s(self) -> float:
@@ -115,9 +124,15 @@ class Live:
         """Until something is so; how long it took [s of wall time]."""
         begin = time.monotonic()
         while not true():
-            assert time.monotonic() - begin < wall_s, "it did not happen in time"
+            assert time.monotonic() - begin < wall_s, f"it did not happen in time: {self.told()}"
             await asyncio.sleep(0.05)
         return time.monotonic() - begin
+
+    def told(self) -> dict[str, Any]:
+        """Who hears whom, and what was refused or lost, for a failure's reason."""
+        parts = ("peers", "duplicates", "clocks", "rejected", "transport")
+        found = {name: member.status for name, member in self.launcher.members.items() if name != "world"}
+        return {name: {part: status.get(part) for part in parts} for name, status in found.items()}
 
     def pid(self, robot: str) -> int:
         return self.launcher.members[robot].process.pid
@@ -174,8 +189,15 @@ def play(
     assert not [pid for pid in pids if alive(pid)]
     assert not list(folder.glob("cofix-*")) and not list(folder.rglob("*.sock"))
     there_was = live[0].launcher.played()
-    trial = collect(there_was, world, run_dir, outcome, False, SEED)
-    return Played(outcome, statuses, trial.trace.t_s, dict(trial.trace.robots), there_was, live[0].notes)
+    trace = collect(there_was, world, run_dir, outcome, False, SEED).trace
+    ended_s = live[0].ended_s
+    # What is published of an instant follows it by as much as data are waited for.
+    rows = len(trace.t_s) if ended_s is None else int((trace.t_s < ended_s - 1.0).sum())
+    robots = {
+        name: replace(state, truth=state.truth[:rows], mean=state.mean[:rows], cov=state.cov[:rows])
+        for name, state in trace.robots.items()
+    }
+    return Played(outcome, statuses, trace.t_s[:rows], robots, there_was, live[0].notes, ended_s is not None)
 
 
 async def _begun(live: Live, disturb: Disturb | None) -> None:

@@ -26,8 +26,10 @@ import pytest
 import tomli_w
 import zenoh
 
+from agent.effects import Publish
+from agent.recording import read_boundary, unpack
 from agent.settings import NS
-from agent.state_file import FILE, REFUSED
+from agent.state_file import FILE, REFUSED, StateFile
 from tests.deploy.lan import Lan, missing
 from tests.deploy.played import Live, Played, play, scenario
 from tests.deploy.test_restart import locate
@@ -42,13 +44,25 @@ SILENT_S = 1.5
 
 def assert_all_well(played: Played, *except_for: str) -> None:
     assert played.outcome.exits == dict.fromkeys(ALL, 0), played.outcome.messages
-    assert not played.outcome.interrupted
+    assert played.outcome.interrupted == played.ended_by_scene
     played.assert_honest(*except_for)
 
 
 def lost(peer: str) -> Any:
     """A status that says that a peer is not heard."""
     return lambda status: status.get("peers", {}).get(peer) is False
+
+
+def hearing(live: Live, peer: str, heard: bool = True) -> bool:
+    """Whether all others hear a peer, or none of them does."""
+    return all(live.status(robot).get("peers", {}).get(peer) is heard for robot in ALL if robot != peer)
+
+
+async def gone_and_back(live: Live, robot: str) -> None:
+    """Until all others have lost a robot and hear it again; the run ends then."""
+    await live.wait(lambda: hearing(live, robot, False))
+    await live.wait(lambda: hearing(live, robot))
+    await live.end(6.0)
 
 
 # -- two short ones -----------------------------------------------------------------------------------------
@@ -125,7 +139,7 @@ def test_on_a_full_disk_it_goes_on_and_says_so() -> None:
 @LONG
 def test_killed_and_started_again(tmp_path: Path) -> None:
     fault = 'faults=[{kind = "crash", robot = "r3", at_s = 6.0, for_s = 8.0}]'
-    played = play(tmp_path, scenario(30.0, fault), 2.0)
+    played = play(tmp_path, scenario(60.0, fault), 2.0, lambda live: gone_and_back(live, "r3"))
     assert_all_well(played)
     for robot in ("r1", "r2", "r4"):
         assert played.ever(robot, lost("r3")) and played.last(robot)["peers"]["r3"]
@@ -135,7 +149,7 @@ def test_killed_and_started_again(tmp_path: Path) -> None:
 @LONG
 def test_paused_and_continued(tmp_path: Path) -> None:
     fault = 'faults=[{kind = "pause", robot = "r2", at_s = 6.0, for_s = 6.0}]'
-    played = play(tmp_path, scenario(25.0, fault), 2.0)
+    played = play(tmp_path, scenario(60.0, fault), 2.0, lambda live: gone_and_back(live, "r2"))
     assert_all_well(played)
     for robot in ("r1", "r3", "r4"):
         assert played.ever(robot, lost("r2")) and played.last(robot)["peers"]["r2"]
@@ -145,17 +159,40 @@ def test_paused_and_continued(tmp_path: Path) -> None:
 
 @LONG
 def test_stopped_in_good_order_and_started_again(tmp_path: Path) -> None:
-    fault = 'faults=[{kind = "restart", robot = "r4", at_s = 6.0, for_s = 6.0}]'
-    played = play(tmp_path, scenario(25.0, fault), 2.0)
+    """What it has kept is what it published last, though it had nothing to write down since it was alone."""
+
+    async def disturb(live: Live) -> None:
+        await live.wait(lambda: live.launcher.members["r4"].gone and live.launcher.members["r4"].exit_code is not None)
+        kept = StateFile(next(tmp_path.glob("cofix-*")) / "r4", "r4").read().state
+        assert kept is not None
+        live.notes["kept_ns"] = msgpack.unpackb(kept)[5]
+        boundary = read_boundary(tmp_path / "run" / "agents" / "r4.mcap", "r4")
+        told = [effect for _, packed in boundary for effect in map(unpack, packed) if isinstance(effect, Publish)]
+        live.notes["published_ns"] = told[-1].estimate.t_ns
+        await gone_and_back(live, "r4")
+
+    alone = '{kind = "isolate", robot = "r4", at_s = 3.0, for_s = 9.0}'
+    faults = f'faults=[{alone}, {{kind = "restart", robot = "r4", at_s = 6.5, for_s = 6.0}}]'
+    played = play(tmp_path, scenario(60.0, faults, "state.interval_s=60.0"), 2.0, disturb)
     assert_all_well(played)
+    assert played.notes["kept_ns"] == played.notes["published_ns"]
     assert played.last("r4")["state_file"]["state.used"] == 1
     assert played.ever("r1", lost("r4")) and played.last("r1")["peers"]["r4"]
 
 
 @LONG
 def test_cut_in_two_and_healed(tmp_path: Path) -> None:
+    def heard(live: Live) -> list[bool]:
+        return [live.status(a).get("peers", {}).get(b, False) for a in ("r1", "r2") for b in ("r3", "r4")]
+
+    async def disturb(live: Live) -> None:
+        await live.until(6.0)
+        await live.wait(lambda: not any(heard(live)))
+        await live.wait(lambda: all(heard(live)))
+        await live.end(6.0)
+
     fault = 'faults=[{kind = "partition", groups = [["r1", "r2"], ["r3", "r4"]], at_s = 6.0, for_s = 10.0}]'
-    played = play(tmp_path, scenario(30.0, fault), 2.0)
+    played = play(tmp_path, scenario(60.0, fault), 2.0, disturb)
     assert_all_well(played)
     for robot, away in (("r1", "r3"), ("r2", "r4"), ("r3", "r1"), ("r4", "r2")):
         assert played.ever(robot, lost(away)) and played.last(robot)["peers"][away]
@@ -203,18 +240,40 @@ class Impostor:
 
 
 @LONG
-def test_a_second_process_of_one_robot_elsewhere_is_named_and_not_believed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("form", ["safe", "split_joint"])
+def test_a_second_process_of_one_robot_elsewhere_is_named_and_not_believed(tmp_path: Path, form: str) -> None:
+    """r1 and r2 hear both. When the second one has ended, the first one begins a new life by itself."""
+
     async def disturb(live: Live) -> None:
         await live.until(5.0)
         async with Impostor(tmp_path, live, "r3"):
-            await live.wait(lambda: all(live.status(robot)["duplicates"] == ["r3"] for robot in ("r1", "r2")))
-            await asyncio.sleep(3.0)
+            told = ("r1", "r2", "r3")
+            await live.wait(lambda: all(live.status(robot)["duplicates"] == ["r3"] for robot in told))
+            await asyncio.sleep(1.0)
+            met = {robot: live.status(robot)["pairs"].get("r3") for robot in ("r1", "r2")}
+            await asyncio.sleep(2.0)
+            assert met == {robot: live.status(robot)["pairs"].get("r3") for robot in ("r1", "r2")}
+            assert live.status("r3")["incarnation"] == 1
+        gone_s = live.t_s
+        await live.wait(lambda: live.status("r3")["incarnation"] > 1)
+        live.notes["begun_s"] = live.t_s - gone_s
+        await live.wait(lambda: not any(live.status(robot)["duplicates"] for robot in ALL))
+        live.notes["refused"] = {robot: live.status(robot)["rejected"]["old_life"] for robot in ("r1", "r2")}
+        if form == "split_joint":
+            gone_ns = live.launcher.t0_ns + gone_s * NS
+            await live.wait(lambda: all(live.status(robot)["pairs"]["r3"] > gone_ns for robot in ("r1", "r2")))
+        await live.end()
 
-    played = play(tmp_path, scenario(30.0), 1.0, disturb)
+    played = play(tmp_path, scenario(60.0, f"localization.form={form}"), 1.0, disturb)
     assert_all_well(played)
     for robot in ("r1", "r2"):
-        assert played.last(robot)["rejected"]["old_life"] >= 3
+        assert played.last(robot)["rejected"]["old_life"] == played.notes["refused"][robot] >= 3
+        assert played.last(robot)["peers"]["r3"]
         assert "duplicate_robot: r3: two processes" in (tmp_path / "run" / "logs" / f"{robot}.log").read_text()
+    log = (tmp_path / "run" / "logs" / "r3.log").read_text()
+    assert "duplicate_robot: r3: two processes" in log and log.count("new_life: ") == 1
+    assert played.outcome.figures["r3"]["endpoint"]["lives_given_up"] == 1
+    print(f"a new life begun {played.notes['begun_s']:.1f} s after the other process ({form})")
 
 
 # -- disks --------------------------------------------------------------------------------------------------
@@ -230,12 +289,17 @@ def test_a_full_disk_while_contacts_rely_on_the_state_file(tmp_path: Path) -> No
         used = live.status("r2")["counters"]["pair.applied_initiator"]
         resource.prlimit(live.pid("r2"), resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
         await live.wait(lambda: {"state.write_failed", "recording.failed"} <= set(live.status("r2")["troubles"]))
-        await live.wait(lambda: live.status("r2")["counters"]["pair.applied_initiator"] >= used + 4)
+        # Before it is killed.
+        more = lambda: live.status("r2")["counters"]["pair.applied_initiator"] >= used + 4
+        await live.wait(more, 13.5 - live.t_s)
         live.notes["status"] = live.status("r2")
         live.notes["files"] = (folder / FILE).exists(), (folder / REFUSED).exists()
+        await live.wait(lambda: live.launcher.members["r2"].life == 2)
+        await live.wait(lambda: live.status("r2").get("counters", {}).get("pair.applied_initiator"))
+        await live.end()
 
     fault = 'faults=[{kind = "crash", robot = "r2", at_s = 14.0, for_s = 2.0}]'
-    played = play(tmp_path, scenario(30.0, fault), 1.0, disturb)
+    played = play(tmp_path, scenario(60.0, fault), 1.0, disturb)
     assert_all_well(played)
     assert played.notes["status"]["troubles"]["state.write_failed"] == "File too large"
     # No start begins with a state that knows less than its peers.
@@ -281,8 +345,9 @@ def test_a_lost_zenoh_session_is_opened_again(tmp_path: Path) -> None:
         await live.wait(
             lambda: all(live.status(robot)["pairs"].get("r2", 0) > then + 3 * NS for robot, then in before.items())
         )
+        await live.end()
 
-    played = play(tmp_path, scenario(35.0), 1.0, disturb)
+    played = play(tmp_path, scenario(60.0), 1.0, disturb)
     assert_all_well(played)
     found = played.last("r2")["transport"]
     assert found["reopened"] == 1 and found["lost_deaf"] == 1
@@ -293,7 +358,10 @@ def test_a_lost_zenoh_session_is_opened_again(tmp_path: Path) -> None:
 @LONG
 @pytest.mark.parametrize("how", ["radio", "process"])
 def test_who_vanishes_in_silence_stalls_nobody(tmp_path: Path, how: str) -> None:
-    """Twenty times a robot is gone without a word, data to it unacknowledged, and back."""
+    """Twenty times a robot is gone without a word, data to it unacknowledged, and back.
+
+    Contacts are as frequent as can be, so the form is the one that is honest then.
+    """
     reason = missing() if how == "radio" else None
     if reason is not None:
         pytest.skip(reason)
@@ -307,16 +375,18 @@ def test_who_vanishes_in_silence_stalls_nobody(tmp_path: Path, how: str) -> None
                 else:
                     os.kill(live.pid("r3"), signal.SIGSTOP)
                 try:
-                    await asyncio.sleep(4.0)
+                    await live.wait(lambda: hearing(live, "r3", False))
                 finally:
                     if how == "radio":
                         lan.appear("r3")
                     else:
                         os.kill(live.pid("r3"), signal.SIGCONT)
-                await asyncio.sleep(4.0)
+                await live.wait(lambda: hearing(live, "r3"))
             live.notes["rounds"] = 20
+            await live.end()
 
-        played = play(tmp_path, scenario(170.0), 1.0, disturb, lan.hosts or None)
+        plan = scenario(400.0, "localization.form=split_joint")
+        played = play(tmp_path, plan, 1.0, disturb, lan.hosts or None)
     assert lan.left == []
     assert_all_well(played)
     assert played.notes["rounds"] == 20

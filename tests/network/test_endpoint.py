@@ -30,6 +30,7 @@ from network.messages import (
     Epoch,
     Header,
     Hello,
+    LifeNotice,
     Packet,
     PairReply,
     ReplyStatus,
@@ -207,6 +208,90 @@ def test_two_processes_under_one_id_are_named_and_neither_is_believed_until_one_
     healed_ns = T0 + 4 * S
     assert len(deliveries(end.receive(healed_ns, second.send(healed_ns, "r2", healed_ns, reply(11))))) == 1
     assert not end.peers()[0].doubled
+
+
+def hears(listener: Endpoint, now_ns: int, packets: list[Packet]) -> list[Any]:
+    return [event for packet in packets for event in listener.receive(now_ns, packet)]
+
+
+def test_who_is_held_to_be_over_begins_a_new_life_once_the_other_process_is_silent() -> None:
+    """r1 runs twice; the newcomer stops after 20 s. r2 and r3 hear both, and are heard by both."""
+    first, second = endpoint("r1", boot_id=1, incarnation=4), endpoint("r1", boot_id=2, incarnation=9)
+    peers = [endpoint("r2"), endpoint("r3")]
+    due: dict[int, int] = {}
+    named: dict[str, set[int]] = {"first": set(), "second": set()}
+    for k in range(80):
+        now_ns = T0 + k * S // 2
+        twice = 10 <= k < 40
+        for peer in peers:
+            for packet in peer.tick(now_ns)[0]:
+                for name, own in (("first", first), *([("second", second)] if twice else [])):
+                    if packet.destination in (None, "r1") and PeerDoubled("r1") in own.receive(now_ns, packet):
+                        named[name].add(k)
+        for own in (first, second) if twice else (first,):
+            for packet in own.tick(now_ns)[0]:
+                hears(peers[0], now_ns, [packet])
+                hears(peers[1], now_ns, [packet])
+            if (number := own.own_life.next_incarnation(now_ns)) is not None:
+                assert own is first
+                due[k] = number
+                first = endpoint("r1", boot_id=3, incarnation=number)
+        if 16 <= k < 40:
+            assert first.own_life.doubled(now_ns) and second.own_life.doubled(now_ns)
+            message = peers[0].send(now_ns, "r1", now_ns, reply(k))
+            assert deliveries(first.receive(now_ns, message)) == deliveries(second.receive(now_ns, message)) == []
+    # Silence is found out after 3 s.
+    assert list(due.values()) == [10] and 40 + 5 <= min(due) <= 40 + 8
+    assert {16, 39} <= named["first"] and {16, 39} <= named["second"]
+    end_ns = T0 + 40 * S
+    for peer in peers:
+        assert (peer.peers()[0].incarnation, peer.peers()[0].up) == (10, True)
+        assert len(deliveries(peer.receive(end_ns, first.send(end_ns, peer.robot, end_ns, reply(99))))) == 1
+        assert adds_up(peer) and not peer.peers()[0].doubled
+
+
+def test_nobody_begins_anew_while_a_peer_still_hears_the_other_process() -> None:
+    own = endpoint("r1", boot_id=1, incarnation=4).own_life
+    assert own.next_incarnation(T0) is None
+    for k in range(40):
+        now_ns = T0 + k * S // 2
+        own.told(now_ns, "r2", LifeNotice(1, 9, True))
+        own.told(now_ns, "r3", LifeNotice(1, 11, False))
+        assert own.next_incarnation(now_ns) is None
+    own.told(now_ns, "r3", LifeNotice(1, 11, True))
+    assert own.next_incarnation(now_ns) == 12
+
+
+def test_notices_that_are_of_others_old_or_absurd_end_no_life() -> None:
+    own = endpoint("r1", boot_id=1, incarnation=4).own_life
+    assert own.next_incarnation(T0) is None
+    now_ns = T0 + 20 * S
+    assert not own.told(now_ns, "r2", LifeNotice(7, 9, True))
+    assert not own.told(now_ns, "r2", LifeNotice(1, 2**41, True))
+    assert own.next_incarnation(now_ns) is None and not own.doubled(now_ns)
+    assert own.told(now_ns, "r2", LifeNotice(1, 9, True))
+    assert own.next_incarnation(now_ns + 3 * S) is None and own.next_incarnation(T0 - S) is None
+
+
+def test_a_life_lasts_for_a_while_whatever_peers_say() -> None:
+    own = endpoint("r1", boot_id=1).own_life
+    for k in range(20):
+        now_ns = T0 + k * S // 2
+        own.told(now_ns, "r2", LifeNotice(1, 9, True))
+        assert own.next_incarnation(now_ns) is None
+    own.told(T0 + 10 * S, "r2", LifeNotice(1, 9, True))
+    assert own.next_incarnation(T0 + 10 * S) == 10
+
+
+def test_a_second_process_with_an_earlier_life_is_named_too() -> None:
+    end, first, second = endpoint("r2"), endpoint("r1", boot_id=1, incarnation=5), endpoint("r1", boot_id=2)
+    told = []
+    for k in range(6):
+        now_ns = T0 + k * S // 2
+        told += [event for own in (first, second) for event in hears(end, now_ns, own.tick(now_ns)[0])]
+    assert PeerDoubled("r1") in told
+    bodies = [decode(packet.payload, "r2").body for packet in end.tick(now_ns)[0]]
+    assert bodies[1:] == [LifeNotice(2, 5, False), LifeNotice(1, 5, False)]
 
 
 def test_a_crowd_beyond_the_table_is_refused() -> None:

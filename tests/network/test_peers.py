@@ -53,12 +53,23 @@ def test_a_straggler_of_a_boot_never_heard_does_not_displace_the_living() -> Non
     assert heard(peer, 8, 1, 1, t_ns=6) == "known"
 
 
-def test_a_higher_incarnation_is_a_new_life_of_the_same_boot() -> None:
+def test_a_higher_incarnation_is_a_new_life_of_another_boot() -> None:
     peer = Peer("r2", 7, 1)
     heard(peer, 7, 1, 3)
-    assert heard(peer, 7, 2, 3) == "change"
+    assert heard(peer, 7, 2, 4, t_ns=1) == heard(peer, 7, 0, 4, t_ns=1) == "old_life"
+    assert heard(peer, 8, 2, 3) == "change"
     assert heard(peer, 7, 1, 4, t_ns=1) == "old_life"
     assert heard(peer, 9, 1, 0, t_ns=1) == "old_life"
+
+
+def test_messages_with_damaged_lives_make_no_second_process() -> None:
+    peer = Peer("r2", 7, 5)
+    heard(peer, 7, 5, 0)
+    for t_ns in range(1, 200):
+        boot_id, incarnation = (7, t_ns % 5) if t_ns % 2 else (1000 + t_ns, 4)
+        assert heard(peer, boot_id, incarnation, t_ns, t_ns=t_ns) == "old_life"
+        assert not peer.outlived(t_ns, t_ns, boot_id)
+    assert peer.notices() == [] and not peer.doubled(200, 3 * S)
 
 
 def test_remembered_boot_ids_are_bounded() -> None:

@@ -32,6 +32,7 @@ from network.messages import (
     Header,
     Hello,
     JointSnapshot,
+    LifeNotice,
     Line,
     Measurement,
     Message,
@@ -154,6 +155,7 @@ EXAMPLES: dict[str, Body] = {
     "joint_request": PairRequest(Epoch(1_000, "r1", 9), example_request().measurements, example_joint()),
     "joint_reply": PairReply(Epoch(1_000, "r2", 9), ReplyStatus.OK, example_joint(met=False)),
     "start_request": StartRequest(Epoch(1000, "r1", 9)),
+    "life_notice": LifeNotice(2**53 - 1, 9, True),
 }
 
 
@@ -576,6 +578,8 @@ SPOILED = {
     "a start asked for in another's name": (put("start_request", (2, 0, 1), "r7"), "source_mismatch"),
     "a start of no instant": (put("start_request", (2, 0), [0, "", 0]), "out_of_range"),
     "a start with more": (put("start_request", (2,), [[1000, "r1", 9], 1]), "malformed"),
+    "a life that is over as a number": (put("life_notice", (2, 2), 1), "wrong_type"),
+    "a life of no number": (put("life_notice", (2, 1), -1), "out_of_range"),
     "known as a number": (put("pair_reply", (2, 2, 7), 1), "wrong_type"),
     "a split of a robot nobody knows": (put("split_reply", (2, 1, 0), "hovercraft"), "unknown_model"),
     "a target of a model nobody knows": (put("split_reply", (2, 1, 1, 0, 1), "hovercraft"), "unknown_model"),

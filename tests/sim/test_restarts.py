@@ -51,6 +51,18 @@ def test_nobody_is_overconfident_after_a_crash(form: str, seeds: tuple[int, ...]
     assert np.mean(found) < 1.5 and max(found) < 4.0, f"seeds {seeds}: {found}"
 
 
+def test_nobody_is_overconfident_after_a_name_was_borne_twice() -> None:
+    """q2 is held to be over, goes on in a life that follows, and each of its peers begins anew with it."""
+    seeds, found = range(1, sized(2, 6) + 1), []
+    for seed in seeds:
+        stranger = {"kind": "forge", "claims": "q2", "content": "stranger", "rate_hz": 1.7, "at_s": 12.0, "for_s": 3.0}
+        result = run_trial(story("safe", 35.0, stranger), seed)
+        late = result.trace.t_s > 21.0
+        found += [float(np.nanmean(nees(trace)[late])) for trace in result.trace.robots.values()]
+        assert total(result, "pair.restarts") == 2, f"seed {seed}"
+    assert np.mean(found) < 1.5 and max(found) < 4.0, f"seeds {seeds}: {found}"
+
+
 @pytest.mark.parametrize("state", ["kept", "lost"])
 def test_fifty_starts_in_a_minute_inflate_nobody_further(state: str) -> None:
     crashes = [crash(state, 5.0 + 1.1 * k, 0.4) for k in range(50)]
@@ -63,7 +75,9 @@ def test_fifty_starts_in_a_minute_inflate_nobody_further(state: str) -> None:
 
 
 def test_a_recording_over_several_lives_plays_back_bit_for_bit(tmp_path: Path) -> None:
-    scenario = story("safe", 20.0, crash("kept", 5.0, 2.0), crash("lost", 12.0, 2.0))
+    """A life that follows in the same process, when a stranger with its name is gone, and two crashes."""
+    stranger = {"kind": "forge", "claims": "q2", "content": "stranger", "rate_hz": 1.7, "at_s": 5.0, "for_s": 3.0}
+    scenario = story("safe", 26.0, stranger, crash("kept", 14.0, 2.0), crash("lost", 20.0, 2.0))
     world = open_world(scenario, 1)
     writer = RecordingWriter(tmp_path / "run.mcap")
     recorders = {}
@@ -73,6 +87,6 @@ def test_a_recording_over_several_lives_plays_back_bit_for_bit(tmp_path: Path) -
     run_trial(scenario, 1, recorders=recorders, life_sink=writer.begin_life)
     writer.close()
     lives = [what for what in read_lives(tmp_path / "run.mcap", "q2") if isinstance(what, Life)]
-    assert [life.state is not None for life in lives] == [True, False]
+    assert [life.state is not None for life in lives] == [True, True, False]
     for robot in scenario.robots:
         assert replay(tmp_path / "run.mcap", robot.id)[2] is None
