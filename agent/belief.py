@@ -110,13 +110,15 @@ NO_PAIR = PairRecord()
 class TargetState:
     """Belief of a target at the robot state's instant: mean (n,), cov (n, n), and when it was last changed.
 
-    `learnt_ns`: when something was last learnt of it, by a sighting of whoever told of it.
+    `learnt_ns`: when something was last learnt of it, by a sighting of whoever told of it. `doubted`: how many own
+    sightings on end have contradicted it.
     """
 
     mean: Array
     cov: Array
     updated_ns: int = 0
     learnt_ns: int = 0
+    doubted: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

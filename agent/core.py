@@ -20,6 +20,8 @@ from agent.events import ClockJudged, Event, Fix, LinkChange, Observation, Odome
 from agent.figures import MAX_KINDS, Figures, known
 from agent.forms import build_filter
 from agent.health import Health
+from agent.peer_work import PeerWork
+from agent.plausible import plausible
 from agent.replay import MAX_LOGGED, ReplayLog
 from agent.saved_state import decode, encode
 from agent.settings import AgentSettings
@@ -61,6 +63,7 @@ class Agent:
         self._published: object = None
         self._tracks: tuple[str, ...] = ()
         self._missing: tuple[str, ...] = ()
+        self._work = PeerWork()
         self._clocks_off: set[str] = set()
         """Peers whose clocks are of no use; the endpoint keeps only so many peers."""
 
@@ -238,13 +241,19 @@ class Agent:
             self._queue(Item(event.t_meas_ns, Phase.PAIR, event.of, event))
 
     def _receive(self, event: Received, effects: list[Effect]) -> None:
-        body = event.message.body
-        if isinstance(body, PairRequest | SplitRequest | StartRequest):
-            self._queue(Item(self._asked_ns(event), Phase.PAIR, event.message.header.source, event))
+        peer, body = event.message.header.source, event.message.body
+        if not plausible(body):
+            self.counters["pair.implausible"] += 1
+        elif isinstance(body, PairRequest | SplitRequest | StartRequest):
+            asked_ns = self._asked_ns(event)
+            if self._work.allowed(peer, self.now_ns, asked_ns):
+                self._queue(Item(asked_ns, Phase.PAIR, peer, event))
+            else:
+                self.counters["pair.too_much_asked"] += 1
         elif isinstance(body, PairReply | SplitReply):
             self._drain(effects)
             with self._told(effects):
-                self.filter.replied(event.message.header.source, body)
+                self.filter.replied(peer, body)
             self._start()
         else:
             self._drain(effects)

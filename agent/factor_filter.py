@@ -27,7 +27,7 @@ from agent.history import History, HistoryMark
 from agent.pairs import Pairs
 from agent.saved_state import SavedFactors
 from agent.settings import AgentSettings
-from agent.tracks import TrackRules
+from agent.tracks import CONTRADICTIONS, TrackRules
 from network.messages import Body, Epoch, Measurement, PairReply, PairRequest, SplitRequest, StartRequest
 
 Array = NDArray[np.float64]
@@ -191,6 +191,10 @@ class FactorFilter:
             localization.correlation == "factors",
             Options(localization.transform, localization.parameters, localization.innovation_cap),
         )
+        health = self._settings.health
+        if health.enabled and nis > health.gate_nis:
+            self._contradicted(then, target, model, event, belief)
+            return
         self._count_nis(f"target_{event.kind}", nis)
         self._counters["used.sighting_own"] += own is not None
         self._counters["used.sighting_target"] += track is not None
@@ -207,6 +211,26 @@ class FactorFilter:
         if state is not self.state:
             self.state = state
             self.history.updated(state, None if own is None or late else own.left)
+
+    def _contradicted(
+        self, then: RobotState, target: str, model: RelativeModel, event: Observation, belief: TargetState
+    ) -> None:
+        """A sighting and a track, which a peer may have told, cannot both be right: neither is used for the other.
+
+        After some on end the track ends, and begins anew if this one tells the place.
+        """
+        self._counters["observation.gated"] += 1
+        doubted = belief.doubted + 1
+        targets = {name: track for name, track in self.state.targets.items() if name != target}
+        if doubted < CONTRADICTIONS:
+            targets[target] = replace(self.state.targets[target], doubted=doubted)
+        self.state = replace(self.state, targets=targets)
+        self.history.updated(self.state)
+        if doubted >= CONTRADICTIONS:
+            self._counters["track.contradicted"] += 1
+            start = self._rules.started(target, model, (then.mean, then.cov), then.t_ns, event.z, event.R)
+            if start is not None:
+                self._start_track(then, target, start)
 
     def _drifted(self, target: str, mean: Array, cov: Array, t_ns: int) -> TargetState:
         """A track of `t_ns` at the newest instant."""

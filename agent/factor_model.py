@@ -20,6 +20,7 @@ from agent.estimation.gaussian import symmetrize, wrap_components
 from agent.estimation.intersection import fuse
 from agent.estimation.motion import STATES, StateLayout
 from agent.estimation.observation import AbsoluteModel, RelativeModel
+from agent.plausible import agree
 from agent.settings import AgentSettings
 from agent.tracks import TrackRules, track_ended
 from network.messages import (
@@ -250,11 +251,14 @@ class SeparateModel:
                     targets[told.target] = TargetState(mean, cov, state.t_ns, learnt_ns)
                 continue
             angles = motion.layout.angles
+            if not agree(self._settings.health, own.mean, own.cov, mean, cov, angles):
+                self._counters["target.gated"] += 1
+                continue
             if localization.correlation == "factors":
                 mean, cov, _ = fuse(own.mean, own.cov, mean, cov, angles, localization.fusion_weight)
             else:
                 gain = own.cov @ np.linalg.inv(own.cov + cov)
                 mean = wrap_components(own.mean + gain @ wrap_components(mean - own.mean, angles), angles)
                 cov = symmetrize(own.cov - gain @ own.cov)
-            targets[told.target] = TargetState(mean, cov, state.t_ns, max(own.learnt_ns, learnt_ns))
+            targets[told.target] = TargetState(mean, cov, state.t_ns, max(own.learnt_ns, learnt_ns), own.doubted)
         return replace(state, targets=targets) if targets else state

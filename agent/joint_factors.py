@@ -267,6 +267,7 @@ class JointFactors:
             self._counters["pair.targets_unused"] += 1
         same_m2 = SAME_TARGET_M2 if complete else np.inf
         met = self.joint.met(initiator, responder, cross, measurements, RESIDUAL_FACTOR, same_m2)
+        self._counters["target.gated"] += len(met.gated)
         m = sum(len(item.z) for item in measurements)
         self._note_nonlinearity(met.residual[:m, :m], block_diagonal([item.R for item in measurements]))
         C_i = P_i @ met.H_i.T + cross @ met.H_j.T

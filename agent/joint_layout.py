@@ -68,7 +68,8 @@ class JointBelief(Protocol):
 class Met:
     """nu (m,) = H_i e_i + H_j e_j + v of two joint errors, v of covariance R (m, m), the measurements' NIS per dof.
 
-    `residual` (m, m) is the second-order one of the measurements, zero for the rest.
+    `residual` (m, m) is the second-order one of the measurements, zero for the rest. `gated` are targets both track,
+    in places that cannot both be right: nothing is used of that.
     """
 
     nu: Array
@@ -77,6 +78,7 @@ class Met:
     R: Array
     nis: float
     residual: Array
+    gated: tuple[str, ...] = ()
 
 
 class JointLayout:
@@ -89,6 +91,7 @@ class JointLayout:
         self._settings = settings
         self._transform, self._parameters = localization.transform, localization.parameters
         self._cap = localization.innovation_cap
+        self._gate = settings.health.gate_nis if settings.health.enabled else None
         self.motions = {target.id: target.motion for target in targets}
         self.tracks = tuple(self.motions)
         self.own = slice(0, settings.layout.dim)
@@ -215,27 +218,34 @@ class JointLayout:
         m = len(z)
         rows = [wrap_components(z - predicted.z, model.angles)]
         theirs = dict(_targets(j)) if math.isfinite(same_m2) else {}
-        shared = [(block, theirs[target], target[1]) for target, block in _targets(i) if target in theirs]
-        size = m + sum(block.stop - block.start for block, _, _ in shared)
+        both_track = [(block, theirs[target], target) for target, block in _targets(i) if target in theirs]
+        shared, gated = [], []
+        for mine, other, (name, kind) in both_track:
+            nu = wrap_components(j.mean[other] - i.mean[mine], STATES[kind].angles)
+            noise = same_m2 * np.eye(len(nu))
+            S = i.cov[mine, mine] + j.cov[other, other] + noise
+            if cross is not None:
+                S = S - cross[mine, other] - cross[mine, other].T
+            noise, _, apart = self._capped(nu, S, noise)
+            if self._gate is not None and not apart <= self._gate:
+                gated.append(name)
+            else:
+                shared.append((mine, other, nu, noise))
+        size = m + sum(len(nu) for _, _, nu, _ in shared)
         H_i, H_j, R = np.zeros((size, len(i.mean))), np.zeros((size, len(j.mean))), np.zeros((size, size))
         H_i[:m, :a], H_j[:m, :b] = predicted.H[:, :a], predicted.H[:, a:]
         noise = symmetrize(own_R + residual_factor * predicted.residual)
         R[:m, :m], _, nis = self._capped(rows[0], predicted.H @ both @ predicted.H.T + noise, noise)
         row = m
-        for mine, other, name in shared:
-            dim = mine.stop - mine.start
-            here = slice(row, row + dim)
-            H_i[here, mine], H_j[here, other] = np.eye(dim), -np.eye(dim)
-            rows.append(wrap_components(j.mean[other] - i.mean[mine], STATES[name].angles))
-            noise = same_m2 * np.eye(dim)
-            S = i.cov[mine, mine] + j.cov[other, other] + noise
-            if cross is not None:
-                S = S - cross[mine, other] - cross[mine, other].T
-            R[here, here], _, _ = self._capped(rows[-1], S, noise)
-            row += dim
+        for mine, other, nu, noise in shared:
+            here = slice(row, row + len(nu))
+            H_i[here, mine], H_j[here, other] = np.eye(len(nu)), -np.eye(len(nu))
+            rows.append(nu)
+            R[here, here] = noise
+            row += len(nu)
         residual = np.zeros((size, size))
         residual[:m, :m] = predicted.residual
-        return Met(np.concatenate(rows), H_i, H_j, R, nis, residual)
+        return Met(np.concatenate(rows), H_i, H_j, R, nis, residual, tuple(gated))
 
 
 def _targets(belief: JointBelief) -> list[tuple[tuple[str, str], slice]]:

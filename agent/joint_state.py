@@ -22,6 +22,7 @@ from agent.factor_model import LONGEST
 from agent.joint_layout import JointLayout, Met
 from agent.joint_tracks import JointState, JointTracks, learnt
 from agent.settings import AgentSettings
+from agent.tracks import CONTRADICTIONS
 from network.messages import (
     MAX_JOINT_DIM,
     MAX_MESSAGE_BYTES,
@@ -55,9 +56,6 @@ INDIFFERENT_RAD2 = 2.25
 
 CONTRADICTING = 9.0
 """NIS per degree of freedom of a sighting that does not agree with a track."""
-
-CONTRADICTIONS = 3
-"""So many of them on end are the track's fault, not the sensor's."""
 
 NEGLIGIBLE = 1e-2
 """Residuals below this share of a measurement's variance do not recur noticeably."""

@@ -18,6 +18,7 @@ from agent.estimation.intersection import fuse
 from agent.estimation.motion import STATES, StateLayout
 from agent.estimation.split_joint import Split
 from agent.estimation.track_start import TrackStart
+from agent.plausible import agree
 from agent.settings import AgentSettings
 from agent.tracks import MUCH_BETTER, TrackRules
 from network.messages import Belief, SplitSnapshot, TargetBelief
@@ -190,20 +191,48 @@ class JointTracks:
 
     def heard(self, state: JointState, told: SplitSnapshot) -> JointState:
         """The state with what a peer has told of targets that the joint belief knows nothing of, or much less."""
-        begin = STATES[told.model].dim
+        for name, model, track in self._tracks_of(state, told):
+            state = self._relayed(state, name, model, track)
+        return state
+
+    def _tracks_of(self, state: JointState, told: SplitSnapshot) -> list[tuple[str, str, RelayedTrack]]:
+        """(target, model, track) of all that a peer has told of targets that the joint belief may take as relayed."""
+        begin, found = STATES[told.model].dim, []
         for (name, model), age_ns in zip(told.targets, told.ages_ns):
             block = slice(begin, begin + STATES[model].dim)
             begin = block.stop
             if name not in state.tracks:
                 track = RelayedTrack(told.mean[block], told.cov[block, block], state.t_ns - age_ns, firm=True)
-                state = self._relayed(state, name, model, track)
+                found.append((name, model, track))
         for item in told.relayed:
-            track = RelayedTrack(item.belief.mean, item.belief.cov, state.t_ns - item.age_ns, firm=False)
-            state = self._relayed(state, item.target, item.belief.model, track)
-        return state
+            belief = item.belief
+            track = RelayedTrack(belief.mean, belief.cov, state.t_ns - item.age_ns, firm=False)
+            found.append((item.target, belief.model, track))
+        return found
+
+    def contradicted(self, state: JointState, told: SplitSnapshot) -> list[str]:
+        """Targets of which a peer has told what the own belief of them, in a relayed track or beside one, gates out."""
+        tracks = self._tracks_of(state, told)
+        return [name for name, model, track in tracks if not self._agrees(state, name, model, track)]
+
+    def _agrees(self, state: JointState, target: str, model: str, told: RelayedTrack) -> bool:
+        """Whether what a peer has told of a target can be right beside what is known of it."""
+        if target not in self.rules or self.rules.model(target) != model:
+            return True
+        known: RelayedTrack | None = state.relayed.get(target)
+        if target in state.tracks:
+            block = self.blocks(state)[state.tracks.index(target)]
+            mean, cov = state.mean[block], state.cov[block, block]
+        elif known is not None:
+            mean, cov = known.mean, known.cov
+        else:
+            return True
+        return agree(self._settings.health, mean, cov, told.mean, told.cov, self._motions[target].layout.angles)
 
     def _relayed(self, state: JointState, target: str, model: str, told: RelayedTrack) -> JointState:
         if target not in self.rules or self.rules.model(target) != model:
+            return state
+        if not self._agrees(state, target, model, told):
             return state
         if self.rules.ended(target, told.cov, told.learnt_ns, state.t_ns):
             return state

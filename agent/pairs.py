@@ -28,6 +28,9 @@ Array = NDArray[np.float64]
 
 FAR_FUTURE_NS = 2**62
 
+MAX_INFLATIONS = 4
+"""Peers that may have the own covariance doubled within one `restart_interval_ns`."""
+
 REFUSALS = {
     Step.ANSWER_BUSY: ReplyStatus.BUSY,
     Step.ANSWER_SUPERSEDED: ReplyStatus.SUPERSEDED,
@@ -257,13 +260,15 @@ class Pairs:
     def _restarted_pair(self, peer: str, now_ns: int, state: RobotState) -> RobotState:
         """Begin the pair anew: own covariance doubled, correlation zero.
 
-        No peer may inflate us again within `restart_interval_ns`; its correlation counts as unknown until then.
+        No peer may inflate us again within `restart_interval_ns`, and no more than `MAX_INFLATIONS` of all of them:
+        their correlation counts as unknown until then.
         """
         if self._settings.unsafe.trust_restarts:
             self._counters["pair.restarts"] += 1
             return state.forgotten(peer, known=True)
-        last = self._inflated_ns.get(peer)
-        if last is not None and now_ns - last < self._settings.localization.restart_interval_ns:
+        interval_ns = self._settings.localization.restart_interval_ns
+        lately = [name for name, t_ns in self._inflated_ns.items() if now_ns - t_ns < interval_ns]
+        if peer in lately or len(lately) >= MAX_INFLATIONS:
             self._counters["pair.restart_refused"] += 1
             return state.forgotten(peer, known=False)
         self._inflated_ns[peer] = now_ns

@@ -28,13 +28,14 @@ from agent.events import LinkChange, Observation, Received
 from agent.health import Health
 from agent.joint_history import JointHistory, Learnt
 from agent.joint_layout import Met
-from agent.joint_state import CONTRADICTIONS, JointModel, Used
+from agent.joint_state import JointModel, Used
 from agent.joint_tracks import JointState
 from agent.pair_clock import PairClocks
 from agent.peer_tables import has_room, remember
 from agent.saved_state import SavedSplit
 from agent.settings import AgentSettings
 from agent.split_exchange import SplitExchange
+from agent.tracks import CONTRADICTIONS
 from network.messages import (
     MAX_MEASUREMENTS,
     Body,
@@ -342,6 +343,7 @@ class SplitFilter:
         used = self._learn(then, lambda s: use(s, found, True), lambda s: use(s, met(s), False).state)
         if used is None:
             return
+        self._counters["target.gated"] += len(found.gated) + len(self._model.tracks.contradicted(then, told))
         self._contacts[peer] = epoch
         if used.nis is not None:
             self._count_nis("pair_" + "+".join(item.kind for item in measurements), used.nis)

@@ -2,7 +2,8 @@
 
 It holds the robot's incarnation, which names its lives in ascending order, and the newest state of its core. A usable
 state is begun with under the same incarnation; peers know by that that nothing they rely on is lost. Without one a new
-life begins, and its number is on disk before it is used.
+life begins, and its number is on disk before it is used, if the disk takes it. If not, the next life may have the same
+number again: it knows of no correlation, peers find that out at the first contact, and begin the pair anew.
 """
 
 from __future__ import annotations

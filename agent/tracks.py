@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 VAGUE = 0.1
 """Variance of a track's place beyond which it is vague, as a share of the squared distance."""
 
+CONTRADICTIONS = 3
+"""So many contradicting sightings on end are a track's fault, not the sensor's."""
+
 MUCH_BETTER = 0.25
 """What is new takes the place of a track whose position variance is so much larger."""
 

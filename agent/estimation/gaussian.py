@@ -14,6 +14,9 @@ from scipy.linalg.lapack import dgesv, dpotrf
 Array = NDArray[np.float64]
 
 TWO_PI = 2.0 * math.pi
+ABSURD = 2.0
+"""Canonical correlation that nothing but a wrong factor leads to; approximations stay within percents of 1."""
+
 LOWEST = -float(np.nextafter(np.pi, 0.0))
 """The smallest wrapped angle: -pi itself is the same direction as pi."""
 
@@ -108,11 +111,14 @@ def clip_canonical_correlations(cov_a: Array, cross: Array, cov_b: Array, limit:
     """Cross-covariance (n, m) with canonical correlations (singular values of L_a^-1 C L_b^-T) <= `limit`.
 
     The product rule for third parties (Luft et al. 2018, eq. 28 of UT-CLAT) is an approximation and can leave
-    a joint covariance indefinite; this is the nearest admissible one in the canonical basis.
+    a joint covariance indefinite; this is the nearest admissible one in the canonical basis. Raises
+    `numpy.linalg.LinAlgError` if they are beyond `ABSURD`: no approximation makes such an error.
     """
     root_a, root_b = np.linalg.cholesky(cov_a), np.linalg.cholesky(cov_b)
     white = np.linalg.solve(root_a, np.linalg.solve(root_b, cross.T).T)
     left, values, right = np.linalg.svd(white, full_matrices=False)
     if values[0] <= limit:
         return cross
+    if not values[0] <= ABSURD:
+        raise np.linalg.LinAlgError("canonical correlations are far above 1")
     return np.asarray(root_a @ (left * np.minimum(values, limit)) @ right @ root_b.T)

@@ -219,3 +219,55 @@ def test_who_does_not_save_first_or_trusts_restarts_is_not_protected() -> None:
     np.testing.assert_array_equal(pair.agents[FIRST].filter.state.cov, before)
     again = begun_again(pair.agents[SECOND].settings)
     np.testing.assert_array_equal(again.cov, STARTS[SECOND][1])
+
+
+class ForgetfulStory(Story):
+    """A robot that has lost its file and could not write the number of its new life down: it has the old number."""
+
+    def learn(self) -> None:
+        if self._untold is not None:
+            robot, self._untold = self._untold, None
+            life = self.pair.lives[robot]
+            self.pair.agents[OTHER[robot]].handle(LinkChange(self.pair.now_ns, robot, True, 1, life))
+            self._late = [letter for letter in self._late if letter.source != robot or letter.life == life]
+
+
+@pytest.mark.parametrize("kept", [False, True])
+@pytest.mark.parametrize("robot", [FIRST, SECOND])
+@pytest.mark.parametrize("again", [FIRST, SECOND])
+@pytest.mark.parametrize("first", WHO)
+def test_a_life_of_an_old_number_that_knows_nothing_claims_no_more_than_is_true(
+    first: str, again: str, robot: str, kept: bool
+) -> None:
+    """The disk is full for two starts on end: the first contact finds no correlation, and begins the pair anew."""
+    fallbacks = 0
+    for fates, when in product(product(FATES, repeat=2), range(3)):
+        note = f"{first}, {again}, {robot} begins anew, told {when}: {' '.join(fates)}"
+        story = ForgetfulStory(("now", "now", *fates))
+        story.step()
+        story.contact((FIRST,))
+        story.step()
+        story.contact(WHO[first])
+        story.reborn(robot, kept)
+        if when == 0:
+            story.learn()
+        story.late()
+        if when == 1:
+            story.learn()
+        story.step()
+        story.contact((again,))
+        story.late()
+        story.step()
+        story.contact((OTHER[again],))
+        story.learn()
+        low, high = (story.pair.agents[name].filter.state.cov for name in (FIRST, SECOND))
+        cross = story.pair.cross()
+        if cross is None:
+            # Nobody takes it for anything: what each claims of itself has to hold.
+            cross = story.ledger.cov(FIRST, SECOND)
+        claimed = np.block([[low, cross], [cross.T, high]])
+        true = np.block([[story.ledger.cov(a, b) for b in (FIRST, SECOND)] for a in (FIRST, SECOND)])
+        lowest = float(np.linalg.eigvalsh(claimed - true).min())
+        assert lowest > -1e-9, f"{note}: too small by {-lowest:.2e}"
+        fallbacks += sum(agent.counters["pair.fallback"] for agent in story.pair.agents.values())
+    assert fallbacks

@@ -198,6 +198,77 @@ def test_no_older_state_follows_one_that_could_not_be_written(
     assert StateFile(tmp_path, "r1").read().state is None
 
 
+class Killed(BaseException):
+    """The process is gone, between two calls of the system."""
+
+
+class Disk:
+    """Lets a process have so many calls of the system, of which some fail by a full disk, and kills it then."""
+
+    def __init__(self, calls: int, full: frozenset[int], patch: pytest.MonkeyPatch) -> None:
+        self.calls, self._left, self._full = 0, calls, full
+        for owner, name, needs_room in (
+            (os, "open", True),
+            (os, "write", True),
+            (os, "fdatasync", True),
+            (os, "fsync", False),
+            (Path, "replace", False),
+        ):
+            self._guard(owner, name, needs_room, patch)
+
+    def _guard(self, owner: object, name: str, needs_room: bool, patch: pytest.MonkeyPatch) -> None:
+        real = getattr(owner, name)
+
+        def call(*args: object) -> object:
+            if self.calls == self._left:
+                raise Killed
+            self.calls += 1
+            if needs_room and self._message in self._full:
+                if name == "write":
+                    real(args[0], args[1][:3])  # type: ignore[index]
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return real(*args)
+
+        patch.setattr(owner, name, call)
+
+    _message = 0
+
+    def about(self, message: int) -> None:
+        """The state of this message is written next."""
+        self._message = message
+
+
+@pytest.mark.parametrize("full", [(), (1,), (2,), (1, 2), (0, 1, 2), (0, 2), (2, 3), (0, 1, 2, 3)])
+def test_no_kill_at_any_moment_has_a_start_know_less_than_peers_were_told(
+    full: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four messages, each with its state before it; the disk is full for some, and the process dies at every call."""
+    moments = 0
+    while True:
+        folder = tmp_path / str(moments)
+        folder.mkdir()
+        (folder / FILE).write_bytes(pack("r1", 7, b"0"))
+        told, survived = 0, False
+        with monkeypatch.context() as patch:
+            disk = Disk(moments, frozenset(full), patch)
+            keeper = StateKeeper(StateFile(folder, "r1"), 7, Counter())
+            try:
+                for message in range(4):
+                    disk.about(message)
+                    if keeper.keep(Persist(str(message + 1).encode(), ahead=True)):
+                        told = message + 1
+                survived = True
+            except Killed:
+                pass
+        found = StateFile(folder, "r1").read()
+        assert found.incarnation == 7, f"killed at call {moments}"
+        assert found.state is None or int(found.state) >= told, f"killed at call {moments}: {found.state!r} of {told}"
+        if survived:
+            break
+        moments += 1
+    assert moments > 8
+
+
 def test_every_new_life_has_a_later_number() -> None:
     assert next_incarnation(None, NOW) == NOW // 1_000_000_000
     assert next_incarnation(7, NOW) == 8

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
 import tracemalloc
 from collections import Counter
@@ -23,6 +24,12 @@ from tests.fuzz.floods import CONTENTS, CoreFlood, EndpointFlood, largest_differ
 CHUNK = 100_000
 EXAMPLES_CHUNK = 10_000
 CORE_SECONDS = 60.0
+LIES_MOVE = 10.0
+"""How far an authentic liar may move any number of an estimate [m, m^2, ...]; it was 0.7 at most."""
+
+JUDGING = ("safe", "joint", "split_joint")
+"""Forms that judge what peers tell."""
+
 RSS_SLACK_MB = 24.0
 """How much a process may grow after its first part: fragments, and caches that fill."""
 
@@ -115,7 +122,8 @@ def core_parts(results: Results, seed: int, count: int) -> None:
                     "decisions": dict(flood.decisions() - still.decisions()),
                 }
             )
-            assert content == "lies" or difference == 0.0, f"{name}: the estimates differ by {difference}"
+            most = 0.0 if content != "lies" else LIES_MOVE if form in JUDGING else math.inf
+            assert difference <= most, f"{name}: the estimates differ by {difference}"
 
 
 def example_parts(results: Results, seed: int, count: int) -> None:

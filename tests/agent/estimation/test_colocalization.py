@@ -344,13 +344,22 @@ def test_the_naive_contact_takes_the_pair_for_uncorrelated() -> None:
 def test_an_inadmissible_correlation_is_clipped_before_it_is_used() -> None:
     joint = random_joint(np.random.default_rng(64))
     low, high = snapshots(joint)
-    low = Snapshot(low.belief, NEW, joint[:3, 3:] * 20.0, np.eye(3))
+    low = Snapshot(low.belief, NEW, joint[:3, 3:] * 1.3, np.eye(3))
+    assert not is_positive_definite(np.block([[joint[:3, :3], low.factor], [low.factor.T, joint[3:, 3:]]]))
     found = contact(low, high, True, BOTH, True, options())
     assert found.cross is not None
     repaired = joint.copy()
     repaired[:3, 3:], repaired[3:, :3] = found.cross, found.cross.T
     assert is_positive_definite(repaired)
     assert np.linalg.eigvalsh(found.S).min() > 0.0
+
+
+def test_a_correlation_far_above_one_is_of_no_contact() -> None:
+    joint = random_joint(np.random.default_rng(64))
+    low, high = snapshots(joint)
+    low = Snapshot(low.belief, NEW, joint[:3, 3:] * 20.0, np.eye(3))
+    with pytest.raises(np.linalg.LinAlgError):
+        contact(low, high, True, BOTH, True, options())
 
 
 def test_a_contact_of_unknown_correlation_says_so() -> None:
