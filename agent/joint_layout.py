@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.colocalization import block_diagonal, stacked
-from agent.estimation.gaussian import quadratic_form, symmetrize, wrap_components
+from agent.estimation.gaussian import identity, quadratic_form, symmetrize, wrap_components
 from agent.estimation.motion import STATES, StateLayout
 from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.estimation.unscented import observe
@@ -225,9 +225,9 @@ class JointLayout:
         for mine, other, name in shared:
             dim = mine.stop - mine.start
             here = slice(row, row + dim)
-            H_i[here, mine], H_j[here, other] = np.eye(dim), -np.eye(dim)
+            H_i[here, mine], H_j[here, other] = identity(dim), -identity(dim)
             rows.append(wrap_components(j.mean[other] - i.mean[mine], STATES[name].angles))
-            noise = same_m2 * np.eye(dim)
+            noise = same_m2 * identity(dim)
             S = i.cov[mine, mine] + j.cov[other, other] + noise
             if cross is not None:
                 S = S - cross[mine, other] - cross[mine, other].T

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,7 +96,7 @@ class JointModel:
         dt_s = (t_ns - state.t_ns) * 1e-9
         found = self._layout(state).moved(state.mean, state.cov, dt_s, delta, delta_cov)
         split = self._within_a_turn(state.split.mapped(found.F, found.own_noise, found.target_noise))
-        return self.tracks.aged(replace(state, t_ns=t_ns, mean=found.mean, split=split), dt_s)
+        return self.tracks.aged(state.with_belief(found.mean, split, t_ns), dt_s)
 
     def _within_a_turn(self, split: Split) -> Split:
         """The split with an own heading no less sure than an unknown one, which has nothing to do with the rest.
@@ -147,7 +147,7 @@ class JointModel:
                 return self._again(state, target, model, z, R)
         used = self._measured(state, model, z, R, self._layout(state).with_target(target), RESIDUAL_FACTOR)
         state = self.tracks.judged(used.state, target, used.nis is None or used.nis <= CONTRADICTING)
-        return replace(used, state=learnt(state, {target: state.t_ns}))
+        return Used(learnt(state, {target: state.t_ns}), used.nis)
 
     def _again(self, state: JointState, target: str, model: RelativeModel, z: Array, R: Array) -> Used:
         """Begin a track anew that has been contradicted on end, and is out of `state`: it was on a wrong side."""
@@ -218,7 +218,7 @@ class JointModel:
         if not is_positive_definite(split.cov):
             raise np.linalg.LinAlgError("covariance is not positive definite")
         mean = wrap_components(state.mean + correction, self._layout(state).state.angles)
-        return replace(state, mean=mean, split=split)
+        return state.with_belief(mean, split, state.t_ns)
 
     # -- peers ----------------------------------------------------------------------------------------------
 

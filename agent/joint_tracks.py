@@ -66,6 +66,10 @@ class JointState:
     def cov(self) -> Array:
         return self.split.cov
 
+    def with_belief(self, mean: Array, split: Split, t_ns: int) -> JointState:
+        """The state with another joint belief of the same tracks."""
+        return JointState(t_ns, mean, split, self.tracks, self.learnt_ns, self.relayed, self.doubted)
+
 
 class JointTracks:
     """What the settings of one robot say of the tracks of its joint state."""

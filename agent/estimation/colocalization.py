@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from agent.estimation.gaussian import (
     clip_canonical_correlations,
     gain,
+    identity,
     is_positive_definite,
     quadratic_form,
     symmetrize,
@@ -99,7 +100,7 @@ def applied(
     posterior = symmetrize(cov - K @ S @ K.T)
     if not is_positive_definite(posterior):
         return None
-    left = gain(posterior, cov) if H is None else np.eye(len(cov)) - K @ H
+    left = gain(posterior, cov) if H is None else identity(len(cov)) - K @ H
     return Update(wrap_components(mean + K @ innovation, layout.angles), posterior, left, nis)
 
 

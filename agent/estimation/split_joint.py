@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import gain, inverse, symmetrize
+from agent.estimation.gaussian import gain, identity, inverse, symmetrize
 
 Array = NDArray[np.float64]
 
@@ -74,7 +74,7 @@ def update_own(split: Split, H: Array, R: Array) -> SplitUpdate:
     """Use a measurement of the own joint state with private noise: H (m, n), R (m, m) including residuals."""
     P = split.cov
     K = gain(P @ H.T, H @ P @ H.T + R)
-    left = np.eye(len(P)) - K @ H
+    left = identity(len(P)) - K @ H
     return SplitUpdate(K, split.mapped(left, K @ R @ K.T))
 
 
@@ -147,7 +147,7 @@ def update_from_peer(
     ratio = math.sqrt(Y[best] / max(float(X[best]), SMALLEST))
     ratio = min(max(ratio, 1.0 / WIDEST), WIDEST)
     K = K[best]
-    left = np.eye(n) - K @ H_own
+    left = identity(n) - K @ H_own
     after = left @ (own.shared * (1.0 + ratio) + own.private) @ left.T
     after += K @ (other_shared * (1.0 + 1.0 / ratio) + foreign) @ K.T
     return SplitUpdate(K, Split(np.zeros((n, n)), symmetrize(after)))
