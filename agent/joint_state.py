@@ -63,7 +63,7 @@ NEGLIGIBLE = 1e-2
 """Residuals below this share of a measurement's variance do not recur noticeably."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Used:
     """A state after information was used, and the NIS per degree of freedom of that; None if there was none."""
 
@@ -211,7 +211,7 @@ class JointModel:
                 return Used(state, seen.nis)
         else:
             update = update_own(state.split, seen.H, seen.noise)
-        return Used(self._shifted(state, update.K @ seen.nu, update.split), seen.nis)
+        return Used(self._shifted(state, update.K.dot(seen.nu), update.split), seen.nis)
 
     def _shifted(self, state: JointState, correction: Array, split: Split) -> JointState:
         """Raises `numpy.linalg.LinAlgError` if the covariance is not positive definite any more."""
@@ -291,7 +291,7 @@ class JointModel:
         indifferent = (heading,) if lost and heading is not None else ()
         update = update_from_peer(own, other, H_own, H_other, met.R, recurring, indifferent)
         if update is not None:
-            state = self._shifted(state, update.K @ met.nu, update.split)
+            state = self._shifted(state, update.K.dot(met.nu), update.split)
             ages = zip(told.targets, told.ages_ns)
             state = learnt(state, {name: state.t_ns - age_ns for (name, _), age_ns in ages})
         return Used(self.tracks.heard(state, told), met.nis)

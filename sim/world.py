@@ -25,7 +25,7 @@ from sim.steering import steered
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Output:
     """One sensor datum at `t_ns` since the start; odometry covers [t0_ns, t_ns].
 

@@ -11,7 +11,7 @@ import copy
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import gain, quadratic_form, symmetrize, wrap_components
+from agent.estimation.gaussian import congruence, gain, quadratic_form, symmetrize, wrap_components
 from agent.estimation.motion import RobotMotion, TargetMotion
 from agent.estimation.observation import AbsoluteModel, RelativeModel, absolute_model
 from agent.estimation.track_start import start_track, start_vaguely
@@ -157,7 +157,7 @@ class CentralizedFilter:
     def _predict(self, name: str, moved: Propagated) -> None:
         part = self._parts[name]
         self.mean[part] = moved.mean
-        self.cov[part, :] = moved.F @ self.cov[part, :]
+        self.cov[part, :] = moved.F.dot(self.cov[part, :])
         self.cov[:, part] = self.cov[part, :].T
         self.cov[part, part] = moved.cov
 
@@ -179,7 +179,7 @@ class CentralizedFilter:
         nis = float(quadratic_form(innovation, S)) / len(innovation)
         if 0.0 < self._cap < nis:
             S = S * (nis / self._cap)
-        K = gain(self.cov[:, rows] @ predicted.H.T, S)
-        self.mean = wrap_components(self.mean + K @ innovation, self._angles)
-        self.cov = symmetrize(self.cov - K @ S @ K.T)
+        K = gain(self.cov[:, rows].dot(predicted.H.T), S)
+        self.mean = wrap_components(self.mean + K.dot(innovation), self._angles)
+        self.cov = symmetrize(self.cov - congruence(K, S))
         return nis

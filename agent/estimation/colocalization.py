@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from agent.estimation.gaussian import (
     clip_canonical_correlations,
+    congruence,
     gain,
     identity,
     is_positive_definite,
@@ -97,7 +98,7 @@ def applied(
 
     `H` spares a solution where K S = P H^T: P+ P^-1 = 1 - K H then.
     """
-    posterior = symmetrize(cov - K @ S @ K.T)
+    posterior = symmetrize(cov - congruence(K, S))
     if not is_positive_definite(posterior):
         return None
     left = gain(posterior, cov) if H is None else identity(len(cov)) - K @ H

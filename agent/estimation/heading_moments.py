@@ -27,7 +27,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import identity, symmetrize, wrap_scalar
+from agent.estimation.gaussian import congruence, identity, symmetrize, wrap_scalar
 from agent.estimation.unscented import Propagated
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ def moved_in_its_frame(
         F[1] += gradient.imag
         weighted = cov @ gradient
         linear, pseudo_linear = float((gradient.conj() @ weighted).real), complex(gradient @ weighted)
-    new = F @ cov @ F.T
+    new = congruence(F, cov)
     # What the step's own spread has beyond its part that is linear in the state: E|z|^2 and E z^2 of a complex number.
     spread = abs(u) ** 2 * (scale**2 + V) - abs(step) ** 2 - linear
     pseudo = u**2 * ((scale + 2j * C) ** 2 + V) * cmath.exp(2j * phi - 2.0 * s2) - step**2 - pseudo_linear

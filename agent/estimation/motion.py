@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import identity, wrap
+from agent.estimation.gaussian import congruence, identity, wrap
 from agent.estimation.heading_moments import moved_in_its_frame
 from agent.estimation.unscented import Propagated, Transform
 
@@ -126,7 +126,7 @@ def advance(
         cos, sin = np.cos(mean[2]), np.sin(mean[2])
         G = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         moved[2] = wrap(moved[2])
-        return Propagated(moved, F @ cov @ F.T + G @ noise @ G.T, F)
+        return Propagated(moved, congruence(F, cov) + congruence(G, noise), F)
     return moved_in_its_frame(mean, cov, delta, delta_cov, 2, persistent_rad2=persistent_rad2)
 
 
@@ -159,7 +159,7 @@ def advance_spatial(
         F[0, 3], F[1, 3] = mean[1] - moved[1], moved[0] - mean[0]
         cos, sin = np.cos(mean[3]), np.sin(mean[3])
         G[:2, :2] = [[cos, -sin], [sin, cos]]
-        found = Propagated(moved, F @ cov @ F.T + G @ delta_cov @ G.T, F)
+        found = Propagated(moved, congruence(F, cov) + congruence(G, delta_cov), F)
     else:
         found = moved_in_its_frame(mean, cov, delta, delta_cov, 3, persistent_rad2=persistent_rad2)
     if held is not None:

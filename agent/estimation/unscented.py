@@ -67,7 +67,7 @@ def sigma_points(mean: Array, root: Array, spread: float) -> Array:
     return points
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Propagated:
     """Predicted mean (..., n), covariance (..., n, n) and F (..., n, n), the left factor of the old error."""
 
@@ -76,7 +76,7 @@ class Propagated:
     F: Array
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Predicted:
     """A predicted measurement: z (..., m), C = Cov(x, z) (..., n, m), Szz (..., m, m) without R, H (..., m, n)."""
 
