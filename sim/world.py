@@ -12,7 +12,7 @@ from agent.config_file import ConfigError
 from agent.config_parts import start_size
 from agent.estimation.gain_motion import reported
 from agent.estimation.gaussian import wrap, wrap_components
-from agent.estimation.motion import LAYOUTS, SPATIAL, UNICYCLE_GAINS, StateLayout, compose, velocity_step
+from agent.estimation.motion import LAYOUTS, SPATIAL, UNICYCLE_GAINS, StateLayout, velocity_step
 from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, OutOfViewError
 from agent.estimation.odometry import OdometryNoise
 from agent.settings import NS, nanoseconds
@@ -176,10 +176,10 @@ class SimulatedWorld:
         control = np.array([mover.control.speed_mps, mover.control.yaw_rate_radps])
         sigma = np.array([mover.noise.speed_mps, mover.noise.yaw_rate_radps])
         moves = dt * (control + sigma * noise)
-        pose = [0, 1, layout.heading]
-        for k in range(self.steps):
-            track[k + 1, pose] = compose(track[k, pose], np.array([moves[k, 0], 0.0, moves[k, 1]]))
-        track[:, layout.heading] = wrap(track[:, layout.heading])
+        heading = np.cumsum(np.append(track[0, layout.heading], moves[:, 1]))
+        along = np.stack([np.cos(heading[:-1]), np.sin(heading[:-1])], axis=1) * moves[:, :1]
+        track[:, :2] = np.cumsum(np.concatenate([track[:1, :2], along]), axis=0)
+        track[:, layout.heading] = wrap(heading)
         if layout is SPATIAL:
             up = normal_rows(self._seed, self.steps, 1, mover.id, "altitude")[:, 0]
             if mover.model == "quadrotor":

@@ -107,7 +107,7 @@ def inverse(matrix: Array) -> Array:
 def quadratic_form(vector: Array, cov: Array) -> Array:
     """v^T P^-1 v for v (..., n), P (..., n, n): the NEES of an error or the NIS of an innovation."""
     if vector.ndim == 1:
-        return np.asarray(vector @ _solved(cov, vector))
+        return np.asarray(vector.dot(_solved(cov, vector)))
     solved = np.linalg.solve(cov, vector[..., None])
     return np.asarray((vector[..., None, :] @ solved)[..., 0, 0])
 

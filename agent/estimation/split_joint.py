@@ -134,10 +134,10 @@ def update_from_peer(
     K = gain(C_private + f_own * C_shared, independent + f_own * own_shared + f_other * other_shared)
     flat = K.reshape(len(K), -1)
     G = (K.swapaxes(-1, -2) @ (metric @ K)).reshape(len(K), -1)
-    of_shared = float((metric * own.shared).sum())
-    X = np.maximum(of_shared - 2.0 * (flat @ (metric @ C_shared).ravel()) + G @ own_shared.ravel(), 0.0)
-    Y = np.maximum(G @ other_shared.ravel(), 0.0)
-    rest = float((metric * own.private).sum()) - 2.0 * (flat @ (metric @ C_private).ravel()) + G @ independent.ravel()
+    of_shared, of_private = float((metric * own.shared).sum()), float((metric * own.private).sum())
+    X = np.maximum(of_shared - 2.0 * flat.dot(metric.dot(C_shared).ravel()) + G.dot(own_shared.ravel()), 0.0)
+    Y = np.maximum(G.dot(other_shared.ravel()), 0.0)
+    rest = of_private - 2.0 * flat.dot(metric.dot(C_private).ravel()) + G.dot(independent.ravel())
     # (sx + sy)^2 is the least of X / w + Y / (1 - w).
     cost = (np.sqrt(X) + np.sqrt(Y)) ** 2 + rest
     best = int(cost.argmin())
