@@ -67,6 +67,7 @@ def sigma_points(mean: Array, root: Array, spread: float) -> Array:
     return points
 
 
+# Results of kernels are not frozen: to make a frozen one takes longer than some of what is in it.
 @dataclass(slots=True, eq=False)
 class Propagated:
     """Predicted mean (..., n), covariance (..., n, n) and F (..., n, n), the left factor of the old error."""
