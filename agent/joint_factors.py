@@ -32,6 +32,7 @@ from agent.belief import CorrelationStack, Part, RobotState, Transition
 from agent.estimation.colocalization import Contact, Update, applied, block_diagonal
 from agent.estimation.gaussian import (
     clip_canonical_correlations,
+    congruence,
     gain,
     is_positive_definite,
     square_root,
@@ -111,7 +112,7 @@ class JointFactors:
     def moved(self, state: RobotState, t_ns: int, delta: Array, cov: Array) -> tuple[RobotState, Transition]:
         dt_s = (t_ns - state.t_ns) * 1e-9
         found = self.joint.moved(state.mean, state.cov, dt_s, delta, cov)
-        after = symmetrize(found.F @ state.cov @ found.F.T + found.own_noise + found.target_noise)
+        after = symmetrize(congruence(found.F, state.cov) + found.own_noise + found.target_noise)
         step = Transition(found.F, self._common_noise(state.mean, dt_s) if self.noise_columns else None)
         return RobotState(t_ns, found.mean, after, state.stack.moved(step), state.pairs), step
 
@@ -147,7 +148,7 @@ class JointFactors:
         seen = self.joint.seen(state.mean, state.cov, part, model, z, R, residual_factor)
         if residual_factor > 1.0:
             self._note_nonlinearity(seen.residual, R)
-        K = gain(state.cov @ seen.H.T, seen.S)
+        K = gain(state.cov.dot(seen.H.T), seen.S)
         return applied(state.mean, state.cov, self.layout, K, seen.S, seen.nu, seen.nis, seen.H)
 
     def _note_nonlinearity(self, residual: Array, R: Array) -> None:
@@ -258,7 +259,8 @@ class JointFactors:
             cross = cross.T
         if self._settings.localization.correlation == "ignored":
             cross = np.zeros((n, m))
-        joint = np.block([[P_i, cross], [cross.T, P_j]])
+        joint = np.empty((n + m, n + m))
+        joint[:n, :n], joint[:n, n:], joint[n:, :n], joint[n:, n:] = P_i, cross, cross.T, P_j
         if not is_positive_definite(joint):
             # Robots that have only the prior in common correlate perfectly; a thousandth of it is forgotten then.
             self._counters["pair.clipped"] += 1
@@ -270,9 +272,9 @@ class JointFactors:
         self._counters["target.gated"] += len(met.gated)
         m = sum(len(item.z) for item in measurements)
         self._note_nonlinearity(met.residual[:m, :m], block_diagonal([item.R for item in measurements]))
-        C_i = P_i @ met.H_i.T + cross @ met.H_j.T
-        C_j = cross.T @ met.H_i.T + P_j @ met.H_j.T
-        S = symmetrize(met.H_i @ C_i + met.H_j @ C_j + met.R)
+        C_i = P_i.dot(met.H_i.T) + cross.dot(met.H_j.T)
+        C_j = cross.T.dot(met.H_i.T) + P_j.dot(met.H_j.T)
+        S = symmetrize(met.H_i.dot(C_i) + met.H_j.dot(C_j) + met.R)
         return Contact(C_i, C_j, S, met.nu, cross, met.nis)
 
     def fused(self, other: AnySnapshot, t_ns: int, state: RobotState) -> RobotState:

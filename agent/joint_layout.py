@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.colocalization import block_diagonal, stacked
-from agent.estimation.gaussian import quadratic_form, symmetrize, wrap_components
+from agent.estimation.gaussian import congruence, identity, quadratic_form, symmetrize, wrap_components
 from agent.estimation.motion import STATES, StateLayout
 from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.estimation.unscented import observe
@@ -26,7 +26,7 @@ from network.messages import Measurement
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Moved:
     """Prediction of a joint belief: mean (n,), F (n, n), and P gains beyond F P F^T: own and target noise (n, n)."""
 
@@ -36,7 +36,7 @@ class Moved:
     target_noise: Array
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Innovation:
     """nu (m,) = H e + v of the joint error e (n,): H (m, n), noise of v (m, m) with residuals, S, NIS per dof.
 
@@ -64,7 +64,7 @@ class JointBelief(Protocol):
     def cov(self) -> Array: ...
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Met:
     """nu (m,) = H_i e_i + H_j e_j + v of two joint errors, v of covariance R (m, m), the measurements' NIS per dof.
 
@@ -120,11 +120,11 @@ class JointLayout:
         own_noise, target_noise = np.zeros((n, n)), np.zeros((n, n))
         found = self._settings.motion.advance(mean[own], cov[own, own], delta, delta_cov, dt_s, self._transform)
         after[own], F[own, own] = found.mean, found.F
-        own_noise[own, own] = found.cov - found.F @ cov[own, own] @ found.F.T
+        own_noise[own, own] = found.cov - congruence(found.F, cov[own, own])
         for motion, block in zip(self.motions.values(), self.blocks):
             found = motion.drift(mean[block], cov[block, block], dt_s, self._transform)
             after[block], F[block, block] = found.mean, found.F
-            target_noise[block, block] = found.cov - found.F @ cov[block, block] @ found.F.T
+            target_noise[block, block] = found.cov - congruence(found.F, cov[block, block])
         return Moved(after, F, own_noise, target_noise)
 
     # -- own measurements -----------------------------------------------------------------------------------
@@ -164,7 +164,7 @@ class JointLayout:
         noise = symmetrize(R + residual_factor * predicted.residual)
         H = np.zeros((len(z), len(mean)))
         H[:, part] = predicted.H
-        S = H @ cov @ H.T + noise
+        S = congruence(H, cov) + noise
         noise, S, nis = self._capped(nu, S, noise)
         return Innovation(nu, H, noise, S, nis, predicted.residual)
 
@@ -222,7 +222,7 @@ class JointLayout:
         shared, gated = [], []
         for mine, other, (name, kind) in both_track:
             nu = wrap_components(j.mean[other] - i.mean[mine], STATES[kind].angles)
-            noise = same_m2 * np.eye(len(nu))
+            noise = same_m2 * identity(len(nu))
             S = i.cov[mine, mine] + j.cov[other, other] + noise
             if cross is not None:
                 S = S - cross[mine, other] - cross[mine, other].T
@@ -235,11 +235,11 @@ class JointLayout:
         H_i, H_j, R = np.zeros((size, len(i.mean))), np.zeros((size, len(j.mean))), np.zeros((size, size))
         H_i[:m, :a], H_j[:m, :b] = predicted.H[:, :a], predicted.H[:, a:]
         noise = symmetrize(own_R + residual_factor * predicted.residual)
-        R[:m, :m], _, nis = self._capped(rows[0], predicted.H @ both @ predicted.H.T + noise, noise)
+        R[:m, :m], _, nis = self._capped(rows[0], congruence(predicted.H, both) + noise, noise)
         row = m
         for mine, other, nu, noise in shared:
             here = slice(row, row + len(nu))
-            H_i[here, mine], H_j[here, other] = np.eye(len(nu)), -np.eye(len(nu))
+            H_i[here, mine], H_j[here, other] = identity(len(nu)), -identity(len(nu))
             rows.append(nu)
             R[here, here] = noise
             row += len(nu)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +61,7 @@ NEGLIGIBLE = 1e-2
 """Residuals below this share of a measurement's variance do not recur noticeably."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Used:
     """A state after information was used, and the NIS per degree of freedom of that; None if there was none."""
 
@@ -94,7 +94,7 @@ class JointModel:
         dt_s = (t_ns - state.t_ns) * 1e-9
         found = self._layout(state).moved(state.mean, state.cov, dt_s, delta, delta_cov)
         split = self._within_a_turn(state.split.mapped(found.F, found.own_noise, found.target_noise))
-        return self.tracks.aged(replace(state, t_ns=t_ns, mean=found.mean, split=split), dt_s)
+        return self.tracks.aged(state.with_belief(found.mean, split, t_ns), dt_s)
 
     def _within_a_turn(self, split: Split) -> Split:
         """The split with an own heading no less sure than an unknown one, which has nothing to do with the rest.
@@ -145,7 +145,7 @@ class JointModel:
                 return self._again(state, target, model, z, R)
         used = self._measured(state, model, z, R, self._layout(state).with_target(target), RESIDUAL_FACTOR)
         state = self.tracks.judged(used.state, target, used.nis is None or used.nis <= CONTRADICTING)
-        return replace(used, state=learnt(state, {target: state.t_ns}))
+        return Used(learnt(state, {target: state.t_ns}), used.nis)
 
     def _again(self, state: JointState, target: str, model: RelativeModel, z: Array, R: Array) -> Used:
         """Begin a track anew that has been contradicted on end, and is out of `state`: it was on a wrong side."""
@@ -209,14 +209,14 @@ class JointModel:
                 return Used(state, seen.nis)
         else:
             update = update_own(state.split, seen.H, seen.noise)
-        return Used(self._shifted(state, update.K @ seen.nu, update.split), seen.nis)
+        return Used(self._shifted(state, update.K.dot(seen.nu), update.split), seen.nis)
 
     def _shifted(self, state: JointState, correction: Array, split: Split) -> JointState:
         """Raises `numpy.linalg.LinAlgError` if the covariance is not positive definite any more."""
         if not is_positive_definite(split.cov):
             raise np.linalg.LinAlgError("covariance is not positive definite")
         mean = wrap_components(state.mean + correction, self._layout(state).state.angles)
-        return replace(state, mean=mean, split=split)
+        return state.with_belief(mean, split, state.t_ns)
 
     # -- peers ----------------------------------------------------------------------------------------------
 
@@ -289,7 +289,7 @@ class JointModel:
         indifferent = (heading,) if lost and heading is not None else ()
         update = update_from_peer(own, other, H_own, H_other, met.R, recurring, indifferent)
         if update is not None:
-            state = self._shifted(state, update.K @ met.nu, update.split)
+            state = self._shifted(state, update.K.dot(met.nu), update.split)
             ages = zip(told.targets, told.ages_ns)
             state = learnt(state, {name: state.t_ns - age_ns for (name, _), age_ns in ages})
         return Used(self.tracks.heard(state, told), met.nis)

@@ -9,6 +9,7 @@ pose alone. So is what began with a range or a bearing alone, until a sighting t
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import accumulate, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +68,10 @@ class JointState:
     def cov(self) -> Array:
         return self.split.cov
 
+    def with_belief(self, mean: Array, split: Split, t_ns: int) -> JointState:
+        """The state with another joint belief of the same tracks."""
+        return JointState(t_ns, mean, split, self.tracks, self.learnt_ns, self.relayed, self.doubted)
+
 
 class JointTracks:
     """What the settings of one robot say of the tracks of its joint state."""
@@ -76,15 +81,14 @@ class JointTracks:
         self._motions = {target.id: target.motion for target in settings.targets}
         self._own = settings.layout.dim
         self.rules = TrackRules(settings)
+        self._blocks: dict[tuple[str, ...], tuple[slice, ...]] = {}
 
-    def blocks(self, state: JointState) -> list[slice]:
+    def blocks(self, state: JointState) -> tuple[slice, ...]:
         """Components of each track, in order."""
-        begin, found = self._own, []
-        for name in state.tracks:
-            end = begin + self._motions[name].layout.dim
-            found.append(slice(begin, end))
-            begin = end
-        return found
+        if state.tracks not in self._blocks:
+            ends = list(accumulate((self._motions[name].layout.dim for name in state.tracks), initial=self._own))
+            self._blocks[state.tracks] = tuple(slice(begin, end) for begin, end in pairwise(ends))
+        return self._blocks[state.tracks]
 
     def initial(self) -> JointState:
         """The state at the start: the own error is private, that of the targets' common prior is shared.

@@ -161,9 +161,9 @@ class Node:
                     out.estimates.append(estimate)
                 case Alarm():
                     out.alarms.append(effect)
-                case Persist(payload, ahead):
+                case Persist(payload):
                     before = out.persist is not None and out.persist.ahead
-                    out.persist = Persist(payload, ahead or before)
+                    out.persist = Persist(payload, True) if before else effect
 
     def _transmit(self, make: Callable[[], Packet], out: Outgoing) -> None:
         """A message that cannot be told (too large, or degenerate numbers) is counted, never fatal."""

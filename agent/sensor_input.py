@@ -159,7 +159,7 @@ def decode(payload: bytes, now_ns: int, sensors: dict[str, SensorConfig]) -> Eve
         if R.diagonal().min() < 0.0 or not is_positive_definite(R + FLOORS):
             raise SensorError("not_positive_definite")
         return Odometry(now_ns, t0_ns, t_ns, z, R)
-    if R.diagonal().min() < FLOOR or not is_positive_definite(R):
+    if not _is_covariance(R):
         raise SensorError("not_positive_definite")
     if kind in ABSOLUTE_KINDS:
         return Fix(now_ns, t_ns, kind, z, R, sensor)
@@ -183,10 +183,17 @@ def _matrix(value: Any, size: int) -> Array:
         raise SensorError("wrong_length")
     for row in value:
         _check_numbers(row, (size,))
-    for index, row in enumerate(value):
-        if any(row[column] != value[column][index] for column in range(index)):
-            raise SensorError("not_positive_definite")
-    return np.array(value, dtype=np.float64)
+    matrix = np.array(value, dtype=np.float64)
+    if size > 1 and (matrix != matrix.T).any():
+        raise SensorError("not_positive_definite")
+    return matrix
+
+
+def _is_covariance(R: Array) -> bool:
+    """Whether noise (n, n) of finite numbers is positive definite, with variances that are not below the floor."""
+    if len(R) == 1:
+        return bool(R.item(0) >= FLOOR)
+    return bool(R.diagonal().min() >= FLOOR) and is_positive_definite(R)
 
 
 def _array(value: Any, sizes: tuple[int, ...]) -> Array:

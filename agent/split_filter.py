@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -384,7 +383,7 @@ class SplitFilter:
 
 
 def _shared(state: JointState) -> JointState:
-    return replace(state, split=state.split.told())
+    return state.with_belief(state.mean, state.split.told(), state.t_ns)
 
 
 def _usable(told: SplitSnapshot) -> bool:

@@ -147,6 +147,8 @@ class LinkModel:
         self.counters: Counter[str] = Counter()
         self._link_state = link_state
         self._log = log
+        chance = settings.loss > 0.0 or settings.duplicate > 0.0 or settings.delay_tail_s > 0.0
+        self._only_fate = None if chance else Fate(False, _delay_ns(settings, 0.0), None)
 
     def carry(self, packet: Packet, header: Header, destination: str, t_send_ns: int) -> list[tuple[int, Packet]]:
         """(delay [ns], packet) of everything that arrives of a packet sent at `t_send_ns` of fleet time."""
@@ -170,7 +172,7 @@ class LinkModel:
         Counted as `out_of_range`, `lost`, or `delivered` and `duplicated`, `corrupted`; lost by a fault also as
         `fault.<name>`.
         """
-        fate = packet_fate(
+        fate = self._only_fate or packet_fate(
             self.settings,
             source=parcel.source,
             destination=parcel.destination,

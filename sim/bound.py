@@ -50,7 +50,9 @@ class BoundRunner:
             else:
                 sensor = self._sensors[item.robot, item.sensor]
                 kind, z, R = sensor.reading(item.kind, item.of, item.z, item.R)
-                self._waiting.append(replace(item, t_ns=item.t_ns - sensor.lag_ns, kind=kind, z=z, R=R))
+                if sensor.lag_ns or kind != item.kind or z is not item.z or R is not item.R:
+                    item = replace(item, t_ns=item.t_ns - sensor.lag_ns, kind=kind, z=z, R=R)
+                self._waiting.append(item)
         self._waiting.sort(key=order)
         end = k * self._step_ns
         while self._waiting and self._waiting[0].t_ns <= end - self._lag_ns:

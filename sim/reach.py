@@ -16,11 +16,15 @@ class Reach:
         self._world, self._range_m, self._hysteresis_m = world, range_m, hysteresis_m
         count = len(world.robots)
         self._heard: NDArray[np.bool_] = np.zeros((count, count), dtype=bool)
+        self._pairs: list[tuple[str, str]] = []
 
     def at(self, k: int) -> list[tuple[str, str]]:
         """(source, destination) pairs in range at instant k; instants are asked for in order."""
         place = np.array([self._world.place(robot, k) for robot in self._world.robots])
         gaps = np.linalg.norm(place[:, None] - place[None], axis=-1)
-        self._heard = hear(self._heard, gaps, self._range_m, self._hysteresis_m)
-        ids = self._world.robots
-        return [(ids[a], ids[b]) for a, b in np.argwhere(self._heard).tolist() if a != b]
+        heard = hear(self._heard, gaps, self._range_m, self._hysteresis_m)
+        if (heard != self._heard).any():
+            ids = self._world.robots
+            self._pairs = [(ids[a], ids[b]) for a, b in np.argwhere(heard).tolist() if a != b]
+        self._heard = heard
+        return self._pairs

@@ -12,21 +12,20 @@ from agent.config_file import ConfigError
 from agent.config_parts import start_size
 from agent.estimation.gain_motion import reported
 from agent.estimation.gaussian import wrap, wrap_components
-from agent.estimation.motion import LAYOUTS, SPATIAL, UNICYCLE_GAINS, StateLayout, compose, velocity_step
-from agent.estimation.mounting import mount_of
-from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, OutOfViewError, RelativeModel
+from agent.estimation.motion import LAYOUTS, SPATIAL, UNICYCLE_GAINS, StateLayout, velocity_step
+from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, OutOfViewError
 from agent.estimation.odometry import OdometryNoise
-from agent.events import LEVEL
 from agent.settings import NS, nanoseconds
 from agent.timeline import Phase
 from sim.noise import generator, normal_rows
 from sim.scenario import RobotPart, Scenario, SensorPart, TargetPart, sensor_kind
+from sim.sight import places, sights
 from sim.steering import steered
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Output:
     """One sensor datum at `t_ns` since the start; odometry covers [t0_ns, t_ns].
 
@@ -148,6 +147,12 @@ class SimulatedWorld:
         else:
             for robot in scenario.robots:
                 self._tracks[robot.id] = self._drive(robot, starts[robot.id])
+        movers = scenario.movers()
+        self._index = {name: index for index, name in enumerate(movers)}
+        self._places = np.stack([places(self._tracks[name], LAYOUTS[part.model]) for name, part in movers.items()])
+        self._fixed = np.array([(*point, 0.0)[:3] for point in self.landmarks.values()]).reshape(-1, 3)
+        self._odometry_noise = {robot.id: control_odometry(robot, scenario.step_s) for robot in scenario.robots}
+        self._sights = sights(scenario, self._tracks, self.landmarks)
         self._tilt = {
             robot.id: robot.tilt_rad * normal_rows(seed, self.steps + 1, 2, robot.id, "attitude")
             for robot in scenario.robots
@@ -171,10 +176,10 @@ class SimulatedWorld:
         control = np.array([mover.control.speed_mps, mover.control.yaw_rate_radps])
         sigma = np.array([mover.noise.speed_mps, mover.noise.yaw_rate_radps])
         moves = dt * (control + sigma * noise)
-        pose = [0, 1, layout.heading]
-        for k in range(self.steps):
-            track[k + 1, pose] = compose(track[k, pose], np.array([moves[k, 0], 0.0, moves[k, 1]]))
-        track[:, layout.heading] = wrap(track[:, layout.heading])
+        heading = np.cumsum(np.append(track[0, layout.heading], moves[:, 1]))
+        along = np.stack([np.cos(heading[:-1]), np.sin(heading[:-1])], axis=1) * moves[:, :1]
+        track[:, :2] = np.cumsum(np.concatenate([track[:1, :2], along]), axis=0)
+        track[:, layout.heading] = wrap(heading)
         if layout is SPATIAL:
             up = normal_rows(self._seed, self.steps, 1, mover.id, "altitude")[:, 0]
             if mover.model == "quadrotor":
@@ -207,10 +212,7 @@ class SimulatedWorld:
         return np.asarray(self._tracks[entity][k])
 
     def place(self, entity: str, k: int) -> Array:
-        layout = LAYOUTS[self._scenario.movers()[entity].model]
-        place = np.zeros(3)
-        place[: len(layout.position)] = self._tracks[entity][k, : len(layout.position)]
-        return place
+        return np.asarray(self._places[self._index[entity], k])
 
     def start_belief(self, entity: str) -> tuple[Array, Array]:
         part = self._scenario.movers()[entity]
@@ -219,11 +221,13 @@ class SimulatedWorld:
 
     def outputs(self, k: int) -> list[Output]:
         found: list[Output] = []
+        there = np.concatenate([self._places[:, k], self._fixed])
+        gaps = np.linalg.norm(there[:, None] - there, axis=-1).tolist()
         for robot in self._scenario.robots:
             found.append(self._odometry(robot, k))
             for name, sensor in robot.sensors.items():
                 if k % self._every(sensor) == 0:
-                    found.extend(self._sense(robot, name, sensor, k))
+                    found.extend(self._sense(robot, name, sensor, k, gaps[self._index[robot.id]]))
         found.sort(key=order)
         return found
 
@@ -239,7 +243,7 @@ class SimulatedWorld:
         if robot.id in self._commands:
             speed, yaw_rate = self._commands[robot.id][k - 1]
         delta = dt * np.array([speed, 0.0, control.climb_mps, yaw_rate])
-        noise = control_odometry(robot, dt)
+        noise = self._odometry_noise[robot.id]
         if LAYOUTS[robot.model] is UNICYCLE_GAINS:
             delta[[0, 1, 3]] = reported(self._tracks[robot.id][k - 1], delta[[0, 1, 3]])
         delta = noise.calibrated(delta)
@@ -253,7 +257,8 @@ class SimulatedWorld:
             self._sensor_noise[key] = normal_rows(self._seed, self.steps + 1, size, *key)
         return np.asarray(self._sensor_noise[key][k])
 
-    def _sense(self, robot: RobotPart, name: str, sensor: SensorPart, k: int) -> list[Output]:
+    def _sense(self, robot: RobotPart, name: str, sensor: SensorPart, k: int, gaps: list[float]) -> list[Output]:
+        """What a sensor measures at instant k; `gaps`: how far all places are from its robot."""
         kind, state, t_ns = sensor_kind(name, sensor), self._tracks[robot.id][k], k * self.step_ns
         layout = LAYOUTS[robot.model]
         if kind not in RELATIVE_ANGLES:
@@ -263,18 +268,11 @@ class SimulatedWorld:
             return [Output(t_ns, Phase.PRIVATE, robot.id, name, kind, None, wrap_components(z, fix.angles), R)]
         outputs = []
         attitude = self._attitude(robot.id, k)
-        intrinsics = sensor.intrinsics.settings()
-        for of, subject, place in self._subjects(robot, sensor, kind, k):
-            model = RelativeModel(
-                kind,
-                layout,
-                mount_of(sensor.mount),
-                tuple(place.tolist()) if subject is None else None,
-                subject or layout,
-                attitude or LEVEL,
-                intrinsics,
-            )
-            joint = state if subject is None else np.concatenate([state, place])
+        for sight in self._sights[robot.id, name]:
+            if gaps[sight.index] > sight.reach_m:
+                continue
+            model = sight.model if attitude is None else replace(sight.model, attitude=attitude)
+            of, joint = sight.of, sight.joint(state, k)
             distance = model.distance(joint)
             if distance < sensor.min_range_m or (sensor.max_range_m is not None and distance > sensor.max_range_m):
                 continue
@@ -286,7 +284,7 @@ class SimulatedWorld:
                 clean = model.h(joint)
             except OutOfViewError:
                 continue
-            if kind == "pixel" and not intrinsics.shows(clean):
+            if kind == "pixel" and model.intrinsics is not None and not model.intrinsics.shows(clean):
                 continue
             R = relative_noise(kind, sensor, distance)
             z = clean + np.sqrt(np.diagonal(R)) * self._noise(robot.id, name, of, k, len(R))
@@ -302,31 +300,6 @@ class SimulatedWorld:
             return None
         roll, pitch = np.clip(self._tilt[robot][k], -1.5, 1.5).tolist()
         return roll, pitch
-
-    def _subjects(
-        self, robot: RobotPart, sensor: SensorPart, kind: str, k: int
-    ) -> list[tuple[str, StateLayout | None, Array]]:
-        """Name, layout (None: a landmark) and true state or place of what a sensor may see."""
-        subjects: list[tuple[str, StateLayout | None, Array]] = []
-        if "peers" in sensor.of:
-            for peer in self._scenario.robots:
-                shared = kind == "range" and sensor.two_way and _ranges_peers(peer) and peer.id < robot.id
-                if peer.id != robot.id and not shared:
-                    subjects.append((peer.id, LAYOUTS[peer.model], self._tracks[peer.id][k]))
-        if "landmarks" in sensor.of:
-            subjects += [(f"landmark:{name}", None, np.array(point)) for name, point in self.landmarks.items()]
-        if "targets" in sensor.of:
-            for target in self._scenario.targets:
-                subjects.append((f"target:{target.id}", LAYOUTS[target.model], self._tracks[target.id][k]))
-        return subjects
-
-
-def _ranges_peers(robot: RobotPart) -> bool:
-    """Whether a robot takes part in two-way ranging; the lower id of such a pair owns the range."""
-    return any(
-        sensor_kind(name, sensor) == "range" and sensor.two_way and "peers" in sensor.of
-        for name, sensor in robot.sensors.items()
-    )
 
 
 def drawn_belief(truth: Array, cov: Array, seed: int, entity: str, angles: tuple[int, ...]) -> tuple[Array, Array]:

@@ -35,6 +35,7 @@ PURE = (
     "agent/frames.py",
     *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "agent" / "estimation").glob("*.py"))),
     "sim/world.py",
+    "sim/sight.py",
     "sim/noise.py",
     "sim/metrics.py",
 )

@@ -11,7 +11,7 @@ import copy
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import gain, quadratic_form, symmetrize, wrap_components
+from agent.estimation.gaussian import congruence, gain, quadratic_form, symmetrize, wrap_components
 from agent.estimation.motion import RobotMotion, TargetMotion
 from agent.estimation.observation import AbsoluteModel, RelativeModel, absolute_model
 from agent.estimation.track_start import start_track, start_vaguely
@@ -21,6 +21,7 @@ from agent.events import LEVEL
 from network.messages import NO_MOUNT, Mount
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
 
 
 class CentralizedFilter:
@@ -59,13 +60,14 @@ class CentralizedFilter:
             angles += [offset + index for index in layout.angles]
             offset += len(mean)
         self._angles = tuple(angles)
+        self._rows: dict[tuple[str, ...], tuple[Rows, tuple[Rows, ...]]] = {}
 
     def copy(self) -> CentralizedFilter:
         """A filter of its own with the same belief."""
         other = copy.copy(self)
         other.mean, other.cov = self.mean.copy(), self.cov.copy()
         other._unseen, other._motions = dict(self._unseen), dict(self._motions)
-        other._layouts, other._parts = dict(self._layouts), dict(self._parts)
+        other._layouts, other._parts, other._rows = dict(self._layouts), dict(self._parts), dict(self._rows)
         return other
 
     def __contains__(self, name: str) -> bool:
@@ -94,7 +96,7 @@ class CentralizedFilter:
     def fix(self, robot: str, kind: str, z: Array, R: Array) -> float | None:
         """Absolute information z (m,), R (m, m): its NIS per degree of freedom; None if the state has none of it."""
         fix = absolute_model(kind, self._layouts[robot], z, R)
-        return None if fix is None else self._update(self._rows(robot), *fix)
+        return None if fix is None else self._update((robot,), *fix)
 
     def observe(
         self,
@@ -111,7 +113,8 @@ class CentralizedFilter:
         Raises `OutOfViewError` for a pixel of what is out of view; nothing has happened then. A target that is `unseen`
         has no NIS, which is told as 0.
         """
-        rows, layout = self._rows(robot), self._layouts[robot]
+        names: tuple[str, ...] = (robot,)
+        layout = self._layouts[robot]
         if of.startswith("landmark:"):
             model = RelativeModel(kind, layout, mount, self._landmarks[of.removeprefix("landmark:")], attitude=attitude)
         else:
@@ -120,9 +123,9 @@ class CentralizedFilter:
                 subject = self._unseen[name][2].layout
                 self._start(name, robot, RelativeModel(kind, layout, mount, subject=subject, attitude=attitude), z, R)
                 return 0.0
-            rows = np.concatenate([rows, self._rows(name)])
+            names = (robot, name)
             model = RelativeModel(kind, layout, mount, subject=self._layouts[name], attitude=attitude)
-        return self._update(rows, model, z, R)
+        return self._update(names, model, z, R)
 
     def _start(self, name: str, robot: str, model: RelativeModel, z: Array, R: Array) -> None:
         """Take in a target that a robot sees, if that tells where it is."""
@@ -143,19 +146,24 @@ class CentralizedFilter:
         joint[n:, n:] = start.cov(self.cov[own, own])
         self.mean, self.cov = np.concatenate([self.mean, start.mean]), joint
 
-    def _rows(self, name: str) -> NDArray[np.intp]:
-        part = self._parts[name]
-        return np.arange(part.start, part.stop)
+    def _components(self, names: tuple[str, ...]) -> tuple[Rows, tuple[Rows, ...]]:
+        """Components of robots and targets, and the index of their covariance; those of a name never change."""
+        if names not in self._rows:
+            parts = [self._parts[name] for name in names]
+            rows = np.concatenate([np.arange(part.start, part.stop) for part in parts])
+            self._rows[names] = rows, np.ix_(rows, rows)
+        return self._rows[names]
 
     def _predict(self, name: str, moved: Propagated) -> None:
         part = self._parts[name]
         self.mean[part] = moved.mean
-        self.cov[part, :] = moved.F @ self.cov[part, :]
+        self.cov[part, :] = moved.F.dot(self.cov[part, :])
         self.cov[:, part] = self.cov[part, :].T
         self.cov[part, part] = moved.cov
 
-    def _update(self, rows: NDArray[np.intp], model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> float:
-        cov = self.cov[np.ix_(rows, rows)]
+    def _update(self, names: tuple[str, ...], model: AbsoluteModel | RelativeModel, z: Array, R: Array) -> float:
+        rows, square = self._components(names)
+        cov = self.cov[square]
         model, z, R = by_angles(model, z, R, cov)
         predicted = observe(
             model.h,
@@ -171,7 +179,7 @@ class CentralizedFilter:
         nis = float(quadratic_form(innovation, S)) / len(innovation)
         if 0.0 < self._cap < nis:
             S = S * (nis / self._cap)
-        K = gain(self.cov[:, rows] @ predicted.H.T, S)
-        self.mean = wrap_components(self.mean + K @ innovation, self._angles)
-        self.cov = symmetrize(self.cov - K @ S @ K.T)
+        K = gain(self.cov[:, rows].dot(predicted.H.T), S)
+        self.mean = wrap_components(self.mean + K.dot(innovation), self._angles)
+        self.cov = symmetrize(self.cov - congruence(K, S))
         return nis

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from agent.estimation.gaussian import (
     clip_canonical_correlations,
+    congruence,
     gain,
+    identity,
     is_positive_definite,
     quadratic_form,
     symmetrize,
@@ -96,10 +98,10 @@ def applied(
 
     `H` spares a solution where K S = P H^T: P+ P^-1 = 1 - K H then.
     """
-    posterior = symmetrize(cov - K @ S @ K.T)
+    posterior = symmetrize(cov - congruence(K, S))
     if not is_positive_definite(posterior):
         return None
-    left = gain(posterior, cov) if H is None else np.eye(len(cov)) - K @ H
+    left = gain(posterior, cov) if H is None else identity(len(cov)) - K @ H
     return Update(wrap_components(mean + K @ innovation, layout.angles), posterior, left, nis)
 
 

@@ -27,7 +27,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import symmetrize, wrap_scalar
+from agent.estimation.gaussian import congruence, identity, symmetrize, wrap_scalar
 from agent.estimation.unscented import Propagated
 
 Array = NDArray[np.float64]
@@ -44,9 +44,9 @@ def moved_in_its_frame(
 ) -> Propagated:
     """Belief (n,), (n, n) of a state x, y, ... after a body increment, with noise in the body frame at its beginning.
 
-    delta (k,) and noise (k, k) are of the increment's dx, dy, [dz,] dyaw, dz being of the third component. `heading`
-    says where the heading sits, `gains` the gains of forward motion and of turning: the chord then leans by half of
-    what the turn is longer. The mean's heading is wrapped. `persistent_rad2`: variance of a
+    delta (k,) and noise (k, k) are of the increment's dx, dy, [dz,] dyaw, dz being of the third component unless that
+    is the heading. `heading` says where the heading sits, `gains` the gains of forward motion and of turning: the chord
+    then leans by half of what the turn is longer. The mean's heading is wrapped. `persistent_rad2`: variance of a
     heading from which on what steps leave over counts as correlated; infinite: the moments of this step alone.
     """
     n, steps = len(mean), delta.tolist()
@@ -65,7 +65,7 @@ def moved_in_its_frame(
     direction = cmath.exp(1j * phi - 0.5 * s2)
     first = (scale + 1j * C) * direction
 
-    moved, F = mean.copy(), np.eye(n)
+    moved, F = mean.copy(), identity(n).copy()
     step = u * first
     moved[0] += step.real
     moved[1] += step.imag
@@ -82,7 +82,7 @@ def moved_in_its_frame(
         F[1] += gradient.imag
         weighted = cov @ gradient
         linear, pseudo_linear = float((gradient.conj() @ weighted).real), complex(gradient @ weighted)
-    new = F @ cov @ F.T
+    new = congruence(F, cov)
     # What the step's own spread has beyond its part that is linear in the state: E|z|^2 and E z^2 of a complex number.
     spread = abs(u) ** 2 * (scale**2 + V) - abs(step) ** 2 - linear
     pseudo = u**2 * ((scale + 2j * C) ** 2 + V) * cmath.exp(2j * phi - 2.0 * s2) - step**2 - pseudo_linear
@@ -99,13 +99,14 @@ def moved_in_its_frame(
     added = np.zeros((n, n))
     added[0, 0], added[1, 1] = 0.5 * (spread + pseudo.real), 0.5 * (spread - pseudo.real)
     added[0, 1] = added[1, 0] = 0.5 * pseudo.imag
-    others = (heading,) if len(steps) == 3 else (2, heading)
-    for row, other in enumerate(others, start=2):
+    spatial = len(steps) == 4 and heading > 2
+    others = ((len(steps) - 1, heading),) if not spatial else ((2, 2), (3, heading))
+    for row, other in others:
         across = body * complex(Q[0][row], Q[1][row])
         added[0, other] = added[other, 0] = across.real
         added[1, other] = added[other, 1] = across.imag
-        for column, another in enumerate(others, start=2):
+        for column, another in others:
             added[other, another] = Q[row][column]
-    if len(steps) == 4:
+    if spatial:
         moved[2] += steps[2]
     return Propagated(moved, symmetrize(new + added), F)

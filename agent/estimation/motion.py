@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import wrap
+from agent.estimation.gaussian import congruence, identity, wrap
 from agent.estimation.heading_moments import moved_in_its_frame
 from agent.estimation.unscented import Propagated, Transform
 
@@ -116,17 +117,17 @@ def advance(
 
     x' = x (+) (u + w), w ~ N(0, Q): UT-CLAT eq. 9-12 with the increment in place of control times step.
     """
-    increment = delta[[0, 1, 3]]
-    noise = delta_cov[PLANAR_SQUARE]
     if transform == "jacobian":
+        increment = delta[[0, 1, 3]]
+        noise = delta_cov[PLANAR_SQUARE]
         moved = compose(mean, increment)
         dx, dy = moved[0] - mean[0], moved[1] - mean[1]
         F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
         cos, sin = np.cos(mean[2]), np.sin(mean[2])
         G = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         moved[2] = wrap(moved[2])
-        return Propagated(moved, F @ cov @ F.T + G @ noise @ G.T, F)
-    return moved_in_its_frame(mean, cov, increment, noise, 2, persistent_rad2=persistent_rad2)
+        return Propagated(moved, congruence(F, cov) + congruence(G, noise), F)
+    return moved_in_its_frame(mean, cov, delta, delta_cov, 2, persistent_rad2=persistent_rad2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,11 +155,11 @@ def advance_spatial(
     if transform == "jacobian":
         pose = compose(mean[[0, 1, 3]], delta[[0, 1, 3]])
         moved = np.array([pose[0], pose[1], mean[2] + delta[2], wrap(pose[2])])
-        F, G = np.eye(4), np.eye(4)
+        F, G = identity(4).copy(), identity(4).copy()
         F[0, 3], F[1, 3] = mean[1] - moved[1], moved[0] - mean[0]
         cos, sin = np.cos(mean[3]), np.sin(mean[3])
         G[:2, :2] = [[cos, -sin], [sin, cos]]
-        found = Propagated(moved, F @ cov @ F.T + G @ delta_cov @ G.T, F)
+        found = Propagated(moved, congruence(F, cov) + congruence(G, delta_cov), F)
     else:
         found = moved_in_its_frame(mean, cov, delta, delta_cov, 3, persistent_rad2=persistent_rad2)
     if held is not None:
@@ -242,10 +243,7 @@ class TargetMotion:
         """Belief (n,), (n, n) after `dt_s` > 0 seconds."""
         if self.layout.heading is None:
             return self._drift_velocity(mean, cov, dt_s)
-        scale = np.sqrt(self.noise_step_s * dt_s)
-        speed, turn = self.control[0] * dt_s, self.control[1] * dt_s
-        delta = np.array([speed, 0.0, 0.0, turn])
-        noise = np.diag([(self.noise_sigma[0] * scale) ** 2, 0.0, 0.0, (self.noise_sigma[1] * scale) ** 2])
+        delta, noise = _controlled(self.control, self.noise_sigma, self.noise_step_s, dt_s)
         if self.layout is SPATIAL:
             return advance_spatial(mean, cov, delta, noise, transform, self.held, self.persistent_rad2)
         return advance(mean, cov, delta, noise, transform, self.persistent_rad2)
@@ -255,6 +253,18 @@ class TargetMotion:
         density = np.array(self.noise_sigma) ** 2 * self.noise_step_s
         Q = Q * np.tile(density, self.layout.dim // len(density))[:, None]
         return Propagated(F @ mean, F @ cov @ F.T + Q, F)
+
+
+@lru_cache(maxsize=256)
+def _controlled(
+    control: tuple[float, float], sigma: tuple[float, ...], noise_step_s: float, dt_s: float
+) -> tuple[Array, Array]:
+    """Increment (4,) and its covariance (4, 4) of a noisy control over `dt_s`, read-only."""
+    scale = math.sqrt(noise_step_s * dt_s)
+    delta = np.array([control[0] * dt_s, 0.0, 0.0, control[1] * dt_s])
+    noise = np.diag([(sigma[0] * scale) ** 2, 0.0, 0.0, (sigma[1] * scale) ** 2])
+    delta.flags.writeable = noise.flags.writeable = False
+    return delta, noise
 
 
 def velocity_step(layout: StateLayout, dt: float, damping_s: float) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,20 +80,18 @@ class AbsoluteModel:
     layout: StateLayout
     size: int = 0
     components: tuple[int, ...] = field(init=False)
+    angles: tuple[int, ...] = field(init=False)
+    turning: Turning = field(init=False)
 
     def __post_init__(self) -> None:
         found = absolute_components(self.kind, self.layout, self.size)
         if found is None:
             raise ValueError(f"kind '{self.kind}' of {self.size} numbers says nothing of a state '{self.layout.name}'")
-        object.__setattr__(self, "components", tuple(state for _, state in found))
-
-    @property
-    def angles(self) -> tuple[int, ...]:
-        return tuple(row for row, column in enumerate(self.components) if column == self.layout.heading)
-
-    @property
-    def turning(self) -> Turning:
-        return tuple((row, self.components[row], 1.0) for row in self.angles)
+        components = tuple(state for _, state in found)
+        angles = tuple(row for row, column in enumerate(components) if column == self.layout.heading)
+        object.__setattr__(self, "components", components)
+        object.__setattr__(self, "angles", angles)
+        object.__setattr__(self, "turning", tuple((row, components[row], 1.0) for row in angles))
 
     def h(self, state: Array) -> Array:
         return np.asarray(state[..., list(self.components)])
@@ -129,12 +128,18 @@ def absolute_components(kind: str, layout: StateLayout, size: int = 0) -> list[t
 
 def absolute_model(kind: str, layout: StateLayout, z: Array, R: Array) -> tuple[AbsoluteModel, Array, Array] | None:
     """The model of absolute information z (m,), R (m, m), with what of it the state has; None if that is nothing."""
-    found = absolute_components(kind, layout, len(z))
+    found = _absolute(kind, layout, len(z))
     if found is None:
         return None
-    rows = [row for row, _ in found]
-    model = AbsoluteModel(kind, layout, len(z))
+    model, rows = found
     return (model, z, R) if len(rows) == len(z) else (model, z[rows], R[np.ix_(rows, rows)])
+
+
+@lru_cache(maxsize=256)
+def _absolute(kind: str, layout: StateLayout, size: int) -> tuple[AbsoluteModel, list[int]] | None:
+    """The model of `size` numbers, and which of them it takes."""
+    found = absolute_components(kind, layout, size)
+    return None if found is None else (AbsoluteModel(kind, layout, size), [row for row, _ in found])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import gain, inverse, symmetrize
+from agent.estimation.gaussian import congruence, gain, identity, inverse, symmetrize
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ SMALLEST = 1e-150
 """A deviation that is divided by instead of zero."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Split:
     """Error covariance P = private + shared, both (n, n) positive semi-definite."""
 
@@ -44,13 +44,12 @@ class Split:
     @property
     def cov(self) -> Array:
         if self._cov is None:
-            object.__setattr__(self, "_cov", self.private + self.shared)
-        assert self._cov is not None
+            self._cov = self.private + self.shared
         return self._cov
 
     def mapped(self, A: Array, private_noise: Array | None = None, shared_noise: Array | None = None) -> Split:
         """The split after the error was mapped by A (m, n) and independent noise (m, m) was added to either part."""
-        private, shared = A @ self.private @ A.T, A @ self.shared @ A.T
+        private, shared = congruence(A, self.private), congruence(A, self.shared)
         if private_noise is not None:
             private = private + private_noise
         if shared_noise is not None:
@@ -62,7 +61,7 @@ class Split:
         return Split(np.zeros_like(self.private), self.cov)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class SplitUpdate:
     """Gain K (n, m) of the innovation and the split after it."""
 
@@ -73,9 +72,9 @@ class SplitUpdate:
 def update_own(split: Split, H: Array, R: Array) -> SplitUpdate:
     """Use a measurement of the own joint state with private noise: H (m, n), R (m, m) including residuals."""
     P = split.cov
-    K = gain(P @ H.T, H @ P @ H.T + R)
-    left = np.eye(len(P)) - K @ H
-    return SplitUpdate(K, split.mapped(left, K @ R @ K.T))
+    K = gain(P.dot(H.T), congruence(H, P) + R)
+    left = identity(len(P)) - K.dot(H)
+    return SplitUpdate(K, split.mapped(left, congruence(K, R)))
 
 
 def _factors(own: float, other: float) -> Array:
@@ -116,12 +115,12 @@ def update_from_peer(
     `indifferent` components may become as unsure as they like: their variances don't count when gains are compared.
     """
     n = len(own.private)
-    C_private, C_shared = own.private @ H_own.T, own.shared @ H_own.T
-    own_private, own_shared = H_own @ C_private, symmetrize(H_own @ C_shared)
-    other_shared = symmetrize(H_other @ other.shared @ H_other.T)
+    C_private, C_shared = own.private.dot(H_own.T), own.shared.dot(H_own.T)
+    own_private, own_shared = H_own.dot(C_private), symmetrize(H_own.dot(C_shared))
+    other_shared = symmetrize(congruence(H_other, other.shared))
     if recurring is not None:
         other_shared = other_shared + recurring
-    foreign = H_other @ other.private @ H_other.T + R
+    foreign = congruence(H_other, other.private) + R
     independent = symmetrize(own_private + foreign)
     metric = inverse(own.cov)
     if indifferent:
@@ -135,10 +134,10 @@ def update_from_peer(
     K = gain(C_private + f_own * C_shared, independent + f_own * own_shared + f_other * other_shared)
     flat = K.reshape(len(K), -1)
     G = (K.swapaxes(-1, -2) @ (metric @ K)).reshape(len(K), -1)
-    of_shared = float((metric * own.shared).sum())
-    X = np.maximum(of_shared - 2.0 * (flat @ (metric @ C_shared).ravel()) + G @ own_shared.ravel(), 0.0)
-    Y = np.maximum(G @ other_shared.ravel(), 0.0)
-    rest = float((metric * own.private).sum()) - 2.0 * (flat @ (metric @ C_private).ravel()) + G @ independent.ravel()
+    of_shared, of_private = float((metric * own.shared).sum()), float((metric * own.private).sum())
+    X = np.maximum(of_shared - 2.0 * flat.dot(metric.dot(C_shared).ravel()) + G.dot(own_shared.ravel()), 0.0)
+    Y = np.maximum(G.dot(other_shared.ravel()), 0.0)
+    rest = of_private - 2.0 * flat.dot(metric.dot(C_private).ravel()) + G.dot(independent.ravel())
     # (sx + sy)^2 is the least of X / w + Y / (1 - w).
     cost = (np.sqrt(X) + np.sqrt(Y)) ** 2 + rest
     best = int(cost.argmin())
@@ -147,7 +146,7 @@ def update_from_peer(
     ratio = math.sqrt(Y[best] / max(float(X[best]), SMALLEST))
     ratio = min(max(ratio, 1.0 / WIDEST), WIDEST)
     K = K[best]
-    left = np.eye(n) - K @ H_own
-    after = left @ (own.shared * (1.0 + ratio) + own.private) @ left.T
-    after += K @ (other_shared * (1.0 + 1.0 / ratio) + foreign) @ K.T
+    left = identity(n) - K.dot(H_own)
+    after = congruence(left, own.shared * (1.0 + ratio) + own.private)
+    after += congruence(K, other_shared * (1.0 + 1.0 / ratio) + foreign)
     return SplitUpdate(K, Split(np.zeros((n, n)), symmetrize(after)))

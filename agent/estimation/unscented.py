@@ -67,7 +67,8 @@ def sigma_points(mean: Array, root: Array, spread: float) -> Array:
     return points
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+# Results of kernels are not frozen: to make a frozen one takes longer than some of what is in it.
+@dataclass(slots=True, eq=False)
 class Propagated:
     """Predicted mean (..., n), covariance (..., n, n) and F (..., n, n), the left factor of the old error."""
 
@@ -76,7 +77,7 @@ class Propagated:
     F: Array
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Predicted:
     """A predicted measurement: z (..., m), C = Cov(x, z) (..., n, m), Szz (..., m, m) without R, H (..., m, n)."""
 

@@ -131,6 +131,20 @@ def test_every_packet_is_counted_once_and_logged() -> None:
         assert not delays or delays[0] == record.delay_ns
 
 
+@pytest.mark.parametrize("part", [{}, {"delay_s": 0.25}, {"loss": 0.5}, {"duplicate": 0.5}, {"delay_tail_s": 0.1}])
+def test_a_link_decides_by_the_fate_of_the_packet_whether_it_leaves_room_for_chance_or_not(
+    part: dict[str, float],
+) -> None:
+    made = LinkSettings(seed=5, **part)
+    model = LinkModel(made, everywhere)
+    for seq in range(40):
+        fate = packet_fate(made, source="r1", destination="r2", channel="pair", incarnation=1, seq=seq)
+        expected = () if fate.lost else (fate.delay_ns,)
+        if not fate.lost and fate.duplicate_delay_ns is not None:
+            expected += (fate.duplicate_delay_ns,)
+        assert model.decide(Parcel("r1", "r2", "pair", 1, seq, 0)).delays_ns == expected
+
+
 def test_without_a_range_the_world_is_not_asked() -> None:
     def nobody(source: str, destination: str, t_send_ns: int) -> bool:
         raise AssertionError

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from agent.estimation.gaussian import (
     clip_canonical_correlations,
+    congruence,
     gain,
+    identity,
     is_positive_definite,
     quadratic_form,
     square_root,
@@ -119,6 +121,24 @@ def test_symmetrizing_keeps_the_symmetric_part() -> None:
 
 def joint_of(cov_a: Array, cross: Array, cov_b: Array) -> Array:
     return np.block([[cov_a, cross], [cross.T, cov_b]])
+
+
+@given(SEED, st.integers(1, 6), st.integers(1, 6))
+def test_a_congruence_is_the_product_of_three(seed: int, n: int, m: int) -> None:
+    rng = np.random.default_rng(seed)
+    A, P = rng.standard_normal((m, n)), rng.standard_normal((n, n))
+    assert np.allclose(congruence(A, P), A @ P @ A.T, rtol=1e-12, atol=1e-12)
+
+
+def test_the_identity_is_not_to_be_written_to() -> None:
+    assert np.array_equal(identity(4), np.eye(4))
+    with pytest.raises(ValueError, match="read-only"):
+        identity(4)[0, 1] = 1.0
+
+
+def test_one_number_is_symmetric() -> None:
+    number = np.array([[0.1 + 0.2]])
+    assert symmetrize(number)[0, 0] == number[0, 0]
 
 
 @given(SEED, st.integers(1, 4), st.integers(1, 4), st.floats(0.0, 1.99))

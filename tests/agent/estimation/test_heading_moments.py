@@ -113,3 +113,12 @@ def test_who_heads_anywhere_and_goes_on_ends_up_anywhere(sigma_rad: float) -> No
     claimed = float(np.trace(cov[:2, :2]))
     assert float((error**2).sum(axis=1).mean()) < 1.02 * claimed
     assert claimed < 4.0 * float((error**2).sum(axis=1).mean())
+
+
+def test_a_planar_pose_takes_no_notice_of_what_is_vertical() -> None:
+    rng = np.random.default_rng(7)
+    root, noise_root, delta = rng.standard_normal((3, 3)), rng.standard_normal((4, 4)), rng.standard_normal(4)
+    cov, noise, planar = 0.1 * root @ root.T, noise_root @ noise_root.T, [0, 1, 3]
+    whole = moved_in_its_frame(np.array([1.0, 2.0, 0.3]), cov, delta, noise, 2)
+    part = moved_in_its_frame(np.array([1.0, 2.0, 0.3]), cov, delta[planar], noise[np.ix_(planar, planar)], 2)
+    assert np.array_equal(whole.mean, part.mean) and np.array_equal(whole.cov, part.cov)
