@@ -24,7 +24,7 @@ WINDOW = (100.0, 300.0)
 NEVER_ABOVE = 1.7
 
 
-def anees(overrides: list[str], seeds: Iterable[int]) -> dict[str, dict[int, float]]:
+def anees(overrides: list[str], seeds: Iterable[int], tracks_last: bool = True) -> dict[str, dict[int, float]]:
     """Mean NEES over the window by robot and seed; tracks of the target are under `t1 of <robot>`."""
     made = load("ut-clat", [f"duration_s={WINDOW[1]}", f"window_s=[{WINDOW[0]}, {WINDOW[1]}]", *overrides])
     found: dict[str, dict[int, float]] = {}
@@ -33,7 +33,7 @@ def anees(overrides: list[str], seeds: Iterable[int]) -> dict[str, dict[int, flo
         items = dict(reduced["robots"])
         items.update({f"t1 of {robot}": item for robot, item in reduced["targets"]["t1"].items()})
         for name, item in items.items():
-            assert item["count"] == 201
+            assert item["count"] == 201 or (name not in reduced["robots"] and not tracks_last), (name, seed)
             found.setdefault(name, {})[seed] = item["nees"] / item["count"]
     return found
 
@@ -67,6 +67,7 @@ def test_the_target_is_not_claimed_to_be_known_better_than_it_is(
 
 def test_without_correlations_the_fleet_fools_itself() -> None:
     """The naive baseline: robots that treat each other as independent grow far too sure."""
-    naive = anees(["localization.form=safe", "localization.correlation=ignored"], FEW_SEEDS)
+    # Tracks of robots that are far too sure contradict what they see, and end.
+    naive = anees(["localization.form=safe", "localization.correlation=ignored"], FEW_SEEDS, tracks_last=False)
     for robot in ("r1", "r2", "r3", "r4"):
         assert np.mean(list(naive[robot].values())) > 5.0, report(robot, naive[robot])
