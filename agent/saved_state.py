@@ -55,7 +55,7 @@ from network.wire_fields import (
 
 Array = NDArray[np.float64]
 
-FORMAT = 2
+FORMAT = 3
 MAX_BYTES = 4_000_000
 MAX_WINDOW = 1000
 """Contacts with a peer that a verdict on it may rest on."""
@@ -94,11 +94,13 @@ class SavedSplit:
     """A belief all of which counts as shared, and the last contact used, by peer.
 
     `until_ns`: what peers have asked at instants up to then may be in the belief; None: it is not.
+    `asked`: the latest instant on the peer's clock, and the highest number, of its requests that were answered.
     """
 
     state: JointState
     contacts: dict[str, Epoch] = field(default_factory=dict)
     until_ns: int | None = None
+    asked: dict[str, tuple[int, int]] = field(default_factory=dict)
 
 
 Saved = SavedFactors | SavedSplit
@@ -246,6 +248,7 @@ def _split(settings: AgentSettings, saved: SavedSplit) -> list[Any]:
         relayed,
         [list(item) for item in state.doubted.items()],
         [[peer, pack_epoch(epoch)] for peer, epoch in saved.contacts.items()],
+        [[peer, *asked] for peer, asked in saved.asked.items()],
     ]
 
 
@@ -370,7 +373,7 @@ def _read_record(fields: tuple[Any, ...], most: int) -> PairRecord:
 
 
 def _read_split(settings: AgentSettings, t_ns: int, mean: Any, cov: Any, body: Any) -> SavedSplit:
-    raw_tracks, relayed, doubted, contacts = read_fields(body, 4)
+    raw_tracks, relayed, doubted, contacts, asked = read_fields(body, 5)
     followed, n = {}, settings.layout.dim
     for item in read_many(raw_tracks):
         target, model, learnt = read_fields(item, 3)
@@ -390,4 +393,9 @@ def _read_split(settings: AgentSettings, t_ns: int, mean: Any, cov: Any, body: A
     )
     if followed.keys() & state.relayed.keys():
         raise StateError("inconsistent")
-    return SavedSplit(state, read_by_id(contacts, 1, lambda f: read_contact(f[0])), until_ns=t_ns)
+    return SavedSplit(
+        state,
+        read_by_id(contacts, 1, lambda f: read_contact(f[0])),
+        t_ns,
+        read_by_id(asked, 2, lambda f: (read_stamp(f[0]), read_integer(f[1]))),
+    )

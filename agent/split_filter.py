@@ -71,7 +71,7 @@ class SplitFilter:
         self._health = health or Health(settings.health, counters)
         self._model = JointModel(settings)
         first = self._model.tracks.initial() if saved is None else saved.state
-        self._known_ns = None if saved is None else saved.until_ns
+        self._before = saved
         self.history = JointHistory(self._model, settings.lateness, first, counters)
         self._motions = {target.id: target.motion for target in settings.targets}
         self._clocks = PairClocks(settings)
@@ -79,6 +79,7 @@ class SplitFilter:
         self._waiting: dict[str, SplitExchange] = {}
         self._lives: dict[str, tuple[int, int]] = {}
         self._contacts: dict[str, Epoch] = {} if saved is None else dict(saved.contacts)
+        self._asked: dict[str, tuple[int, int]] = {} if saved is None else dict(saved.asked)
         self._told_of: tuple[JointState | None, Estimate] = None, Estimate(0, "", settings.mean, settings.cov)
 
     @property
@@ -125,7 +126,7 @@ class SplitFilter:
         return dict(self._contacts)
 
     def saved(self) -> SavedSplit:
-        return SavedSplit(_shared(self.state), dict(self._contacts))
+        return SavedSplit(_shared(self.state), dict(self._contacts), asked=dict(self._asked))
 
     def form(self) -> tuple[str, str]:
         return "split_joint", "configured"
@@ -282,16 +283,31 @@ class SplitFilter:
             if reply is not None:
                 effects.append(Send(peer, epoch.t_meas_ns, reply))
             return
-        known = self._known_ns is not None and t_ns <= self._known_ns + self._settings.lateness.tolerance_ns
-        then = None if known else self.history.at(t_ns)
+        then = None if self._used_before(epoch, t_ns) else self.history.at(t_ns)
         if then is None:
             self._counters["pair.too_old"] += 1
             exchange.answered(epoch, None)
             return
         reply = SplitReply(epoch, self._told(then, ()))
         exchange.answered(epoch, reply)
+        last_ns, number = self._asked.get(peer, (epoch.t_meas_ns, epoch.counter))
+        asked = max(epoch.t_meas_ns, last_ns), max(epoch.counter, number)
+        remember(self._asked, peer, asked, self._exchanges)
         effects.append(Send(peer, epoch.t_meas_ns, reply))
         self._apply(peer, epoch, t_ns, request.snapshot, request.measurements, own_initiated=False)
+
+    def _used_before(self, epoch: Epoch, t_ns: int) -> bool:
+        """Whether a request, of the instant `t_ns` of the own clock, may be in the belief that this life began with.
+
+        Its instant alone does not tell: how far the clocks are apart is found out anew in each life.
+        """
+        before = self._before
+        if before is None:
+            return False
+        last_ns, number = before.asked.get(epoch.initiator, (-1, -1))
+        if epoch.t_meas_ns <= last_ns and epoch.counter <= number:
+            return True
+        return before.until_ns is not None and t_ns <= before.until_ns + self._settings.lateness.tolerance_ns
 
     def replied(self, peer: str, body: Body) -> None:
         if not isinstance(body, SplitReply):

@@ -13,14 +13,14 @@ import pytest
 
 from agent.core import Agent
 from agent.effects import Effect, Persist
-from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received
+from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received, Tick
 from agent.recording import pack
 from agent.saved_state import FORMAT, begun_again, decode
 from agent.settings import NS, AgentSettings, LocalizationSettings
 from agent.state_fields import StateError
 from agent.state_file import Found
 from agent.state_keeper import start, succeed
-from network.messages import Header, Message
+from network.messages import Header, Message, SplitRequest
 from tests.agent.team_story import DELTA, NOISE, PLACES, TARGET, Team, settings
 
 FACTORS = ("safe", "published", "joint")
@@ -130,17 +130,34 @@ def test_without_factors_the_belief_is_the_same_and_all_of_it_is_shared(form: st
     assert team.compared > 180
 
 
-def test_what_a_peer_asked_before_is_not_used_again_without_factors() -> None:
-    """Its private noise of then is in the belief that was kept."""
+@pytest.mark.parametrize("apart_ns", [0, -5 * NS // 1000, 5 * NS // 1000])
+def test_what_a_peer_asked_before_is_not_used_again_without_factors(apart_ns: int) -> None:
+    """Its private noise of then is in the belief that was kept, however far apart the clocks are taken to be now."""
     team, _ = driven("split_joint")
     now = team.now_ns
     team.handle("r1", Observation(now, now, "vector", "r2", np.array([4.0, 2.0]), np.eye(2) * 0.2, "camera"))
     ((_, request),) = team.letters
     team.converse()
-    twin = Agent(team.settings["r2"], payload_of(team.agents["r2"]))
+    own = team.settings["r2"]
+    unsure = replace(own, lateness=replace(own.lateness, clock_sigma_ns=NS // 100))
+    twin = Agent(unsure, payload_of(team.agents["r2"]))
+    twin.handle(Odometry(now + NS, now, now + NS, DELTA, NOISE))
+    twin.handle(Tick(now + NS))
     before = twin.filter.revision
-    twin.handle(Received(now, Message(Header("r1", 1, 1, 99, now, now), request.body)))
+    again = Message(Header("r1", 1, 1, 99, now, now), request.body)
+    twin.handle(Received(now + NS, again, offset_ns=apart_ns, offset_sigma_ns=1000))
     assert twin.filter.revision is before and twin.counters["pair.too_old"] == 1
+    assert not twin.counters["pair.applied_responder"]
+    # A later one is, whatever its number.
+    z = np.array([4.0, 2.0])
+    for name in ("r1", "r2"):
+        team.handle(name, Odometry(now + NS, now, now + NS, DELTA, NOISE))
+    team.handle("r1", Observation(now + NS, now + NS, "vector", "r2", z, np.eye(2) * 0.2, "camera"))
+    ((_, later),) = team.letters
+    assert isinstance(later.body, SplitRequest)
+    anew = replace(later.body, epoch=replace(later.body.epoch, counter=1))
+    twin.handle(Received(now + NS, Message(Header("r1", 1, 1, 100, now, now), anew)))
+    assert twin.counters["pair.applied_responder"] == 1
 
 
 def test_a_robot_that_waits_for_its_start_keeps_nothing() -> None:
