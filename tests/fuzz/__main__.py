@@ -25,7 +25,7 @@ CHUNK = 100_000
 EXAMPLES_CHUNK = 10_000
 CORE_SECONDS = 60.0
 LIES_MOVE = 10.0
-"""How far an authentic liar may move any number of an estimate [m, m^2, ...]; it was 0.7 at most."""
+"""How far an authentic liar may move any number of an estimate [m, m^2, ...]; it was 1.7 at most."""
 
 JUDGING = ("safe", "joint", "split_joint")
 """Forms that judge what peers tell."""
