@@ -125,7 +125,7 @@ class Node:
 
     def status(self) -> dict[str, Any]:
         """What a person wants to know, as plain values."""
-        peers = self.endpoint.peers()
+        peers = self.endpoint.peers(self._now_ns)
         clocks = {
             peer.peer: {
                 "offset_s": peer.offset_ns * 1e-9,
@@ -144,6 +144,7 @@ class Node:
             "peers": {peer.peer: peer.up for peer in peers},
             "clocks": clocks,
             "duplicates": sorted(doubled + [peer.peer for peer in peers if peer.doubled]),
+            "unheard_by": [peer.peer for peer in peers if not peer.hears_us],
             "rejected": rejected(self),
         }
 

@@ -167,6 +167,7 @@ class LiveTable:
         notes += [f"injected: {injected}"] if injected else []
         for name, running in sorted(launcher.members.items()):
             notes += [f"{name}: {reason}" for reason in running.status.get("health", {}).get("reasons", [])]
+            notes += [f"{name}: hears {peer} and is not heard by it" for peer in running.status.get("unheard_by", [])]
         table = Table(
             title=title,
             title_justify="left",

@@ -131,7 +131,7 @@ class PeerStatus:
     """What is known of one peer, for people: `counts` has accepted, rejected, lives, clock_refused.
 
     `clock_unusable`: why its clock is of no use; None: it is. `silence_max_ns`: longest time between two messages.
-    `doubled`: two processes send under its id.
+    `doubled`: two processes send under its id. `hears_us`: False if it is heard and has not heard us for some time.
     """
 
     peer: str
@@ -146,6 +146,7 @@ class PeerStatus:
     counts: dict[str, int]
     silence_max_ns: int = 0
     doubled: bool = False
+    hears_us: bool = True
 
 
 class Endpoint:
@@ -350,6 +351,8 @@ class Endpoint:
         return peer.clock.at(now_ns) is not None
 
     def _take_echo(self, now_ns: int, header: Header, hello: Hello, peer: Peer) -> None:
+        if len(hello.echoes) < MAX_ECHOES:
+            peer.told_whom_it_hears(now_ns, any(echo.peer == self.robot for echo in hello.echoes))
         # Those of stamps that another process of our id has sent are of its clock.
         for echo in () if self.own_life.doubled(now_ns) else hello.echoes:
             if echo.peer == self.robot and not peer.clock.add(echo.t1_ns, echo.t2_ns, header.t_send_ns, now_ns):
@@ -366,8 +369,8 @@ class Endpoint:
 
     # --- for people ---------------------------------------------------------------------------------------
 
-    def peers(self) -> tuple[PeerStatus, ...]:
-        """Everybody ever heard and not forgotten, by id."""
+    def peers(self, now_ns: int = 0) -> tuple[PeerStatus, ...]:
+        """Everybody ever heard and not forgotten, by id, as it is at `now_ns`."""
         return tuple(
             PeerStatus(
                 peer.robot,
@@ -382,6 +385,7 @@ class Endpoint:
                 dict(peer.counters),
                 peer.silence_max_ns,
                 peer.doubled_ns is not None,
+                peer.hears_us(now_ns, self.settings.silent_after_ns),
             )
             for peer in self._table.sorted()
         )

@@ -71,6 +71,7 @@ class Peer:
         self.doubled_ns: int | None = None
         self._other: int | None = None
         self._other_heard = False
+        self._unheard_ns: int | None = None
         self.clock = PeerClock()
         self.clock_unusable: str | None = None
         self.counters: Counter[str] = Counter()
@@ -119,6 +120,17 @@ class Peer:
         told = [LifeNotice(self._other, self.incarnation, not self.up)]
         return [*told, LifeNotice(self.boot_id, self.incarnation, False)] if self.up else told
 
+    def told_whom_it_hears(self, now_ns: int, us: bool) -> None:
+        """Take from one of its hellos, which tells all that it hears, whether we are among them."""
+        if us:
+            self._unheard_ns = None
+        elif self._unheard_ns is None:
+            self._unheard_ns = now_ns
+
+    def hears_us(self, now_ns: int, silent_after_ns: int) -> bool:
+        """Whether it does as far as is known: a link may work in one direction alone."""
+        return not self.up or self._unheard_ns is None or now_ns - self._unheard_ns < silent_after_ns
+
     def doubled(self, now_ns: int, silent_after_ns: int) -> bool:
         """Whether two processes bear this robot's id: until the former one is silent for `silent_after_ns`."""
         if self.doubled_ns is not None and not 0 <= now_ns - self.doubled_ns < silent_after_ns:
@@ -141,6 +153,8 @@ class Peer:
             changed = True
         if self._began_ns is None:
             self._began_ns = t_send_ns
+        if changed:
+            self._unheard_ns = None
         self._windows.setdefault(channel, DuplicateWindow()).record(seq)
         if self.counters["accepted"]:
             self.silence_max_ns = max(self.silence_max_ns, now_ns - self.heard_ns)

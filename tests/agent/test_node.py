@@ -88,6 +88,29 @@ def test_hearing_a_peer_for_the_first_time_is_an_event_of_the_core() -> None:
     assert event == LinkChange(1, "r2", True, 1, 7)
 
 
+def test_a_peer_that_is_heard_and_does_not_hear_us_is_named() -> None:
+    one, other = introduced()
+
+    def hellos(until_s: int, back: bool) -> list[list[str]]:
+        """Both say hello each second; `back`: whether the other hears it."""
+        told = []
+        for second in range(until_s - 7, until_s + 1):
+            for packet in one.on_tick(second * S).packets:
+                if back:
+                    other.on_packet(second * S, packet)
+            for packet in other.on_tick(second * S).packets:
+                one.on_packet(second * S, packet)
+            told.append(one.status()["unheard_by"])
+        return told
+
+    assert hellos(8, True) == [[]] * 8
+    # It goes on echoing us until it takes us for gone, and so long again it is given for a hello that got lost.
+    deaf = hellos(16, False)
+    assert deaf[:3] == [[]] * 3 and deaf[-1] == ["r2"]
+    assert one.status()["peers"] == {"r2": True} and other.status()["peers"] == {"r1": False}
+    assert hellos(24, True)[-1] == []
+
+
 def test_who_is_told_that_its_life_is_over_says_so_and_asks_for_another() -> None:
     one, other = introduced()
     last_ns = 9 * S
