@@ -26,12 +26,15 @@ class NodeTimer:
 
     def arm(self, deadline_ns: int) -> None:
         """Call at `deadline_ns`, and not at the deadline before."""
+        clock = self._clock()
+        now_ns = clock.now_ns()
         if self._handle is not None:
             if deadline_ns == self._due_ns:
                 return
             self._handle.cancel()
-        clock = self._clock()
-        now_ns = clock.now_ns()
+            if now_ns > self._set_ns:
+                # After a pause what has come in goes before the timer, and may do what that was for.
+                self.lags.add(now_ns - self._set_ns)
         wait_s = min(max(clock.wall_s(deadline_ns - now_ns), MIN_WAIT_S), MAX_WAIT_S)
         self._due_ns, self._set_ns = deadline_ns, max(deadline_ns, now_ns)
         self._handle = asyncio.get_running_loop().call_later(wait_s, self._on_timer)

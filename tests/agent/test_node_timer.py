@@ -83,3 +83,10 @@ def test_when_the_clock_is_set_an_equal_deadline_is_waited_for_anew(desk: Desk) 
     desk.timer.cancel()
     desk.timer.arm(4 * NS)
     assert desk.waits_s == [2.0, 1.0] and desk.cancelled == 1
+
+
+def test_what_is_done_before_an_overdue_timer_hides_no_lag(desk: Desk) -> None:
+    desk.timer.arm(NS)
+    desk.time_ns = 7 * NS
+    desk.timer.arm(8 * NS)
+    assert desk.timer.lags.max_ns == 6 * NS and desk.cancelled == 1
