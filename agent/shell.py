@@ -39,7 +39,8 @@ from agent.settings import nanoseconds
 from agent.state_file import StateFile
 from agent.state_keeper import Start, StateKeeper, start, succeed
 from network.messages import Channel, Packet
-from network.zenoh_transport import ZenohSettings, ZenohTransport
+from network.zenoh_session import ZenohSettings
+from network.zenoh_transport import ZenohTransport
 
 log = logging.getLogger("cofix.agent")
 

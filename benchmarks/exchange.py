@@ -17,7 +17,8 @@ from agent.sensor_input import encode
 from benchmarks.fleet import scenario
 from network.messages import Channel, Packet
 from network.transport import free_port
-from network.zenoh_transport import ZenohSettings, ZenohTransport, link_pair
+from network.zenoh_session import ZenohSettings, link_pair
+from network.zenoh_transport import ZenohTransport
 from sim.agents import agent_config
 from sim.scenario import Scenario
 from sim.world import Output, SimulatedWorld

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from agent.estimation.motion import LAYOUTS
-from network.zenoh_transport import link_pair
+from network.zenoh_session import link_pair
 from sim.agents import agent_tables, autopilot_fix, odometry_table, table
 from sim.fault_plan import trial_faults
 from sim.host import HostPlan

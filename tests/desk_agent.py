@@ -14,7 +14,7 @@ from pathlib import Path
 import tomli_w
 
 from network.transport import free_port
-from network.zenoh_transport import link_pair
+from network.zenoh_session import link_pair
 
 DEADLINE_S = 30.0
 ANCHORS = {"a1": (0.0, 0.0), "a2": (6.0, 0.0), "a3": (0.0, 8.0)}
