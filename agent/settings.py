@@ -56,13 +56,14 @@ class LocalizationSettings:
 
 @dataclass(frozen=True, slots=True)
 class RoundSettings:
-    """When robots tell each other what an instant brought: at whole multiples of `period_ns` since the run's start.
+    """When robots tell each other what an instant brought: at whole multiples of `period_ns` since `anchor_ns`.
 
     wait_ns  a round ends when all neighbours have told, or this long after its instant
     lean     one message per round: plans are made of what is told before the corrections
     """
 
     period_ns: int = NS
+    anchor_ns: int = 0
     wait_ns: int = NS // 5
     lean: bool = False
 
