@@ -1,7 +1,7 @@
 """What neighbours have told of one instant, carried to another one (Su 2022, eq. 2.6, 2.7; what is told is late).
 
-Nobody knows how a peer has moved since it told, but how fast it went. Its pose is moved on with that, and its covariance
-grows with the time; for the errors of velocities are not new at each instant, by the square of it. A target is moved on
+Nobody knows how a peer has moved since it told, but how fast it went. Its pose is moved on with that, and its
+covariance grows with the time; by its square, for an unknown velocity lasts. A target is moved on
 by its model, and so is the place where a sensor has seen it.
 """
 
