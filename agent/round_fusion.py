@@ -220,9 +220,9 @@ class RoundFusion:
             assert before is not None
         learnt = []
         others = []
-        for item, learnt_ns in beliefs.values():
-            if agree(self._settings.health, before.mean, before.cov, item.mean, item.cov, layout.angles):
-                others.append((item.mean, item.cov))
+        for belief, learnt_ns in beliefs.values():
+            if agree(self._settings.health, before.mean, before.cov, belief.mean, belief.cov, layout.angles):
+                others.append((belief.mean, belief.cov))
                 learnt.append(learnt_ns)
             else:
                 self._counters["round.disagrees"] += 1

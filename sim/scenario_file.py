@@ -83,7 +83,7 @@ def merged(base: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
         before = base.get(key)
         if isinstance(before, dict) and isinstance(value, dict):
             found[key] = merged(before, value)
-        elif _by_id(before) and _by_id(value):
+        elif isinstance(before, list) and _by_id(before) and _by_id(value):
             entries = {item["id"]: item for item in before}
             for item in value:
                 entries[item["id"]] = merged(entries.get(item["id"], {}), item)
@@ -95,7 +95,7 @@ def merged(base: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
 
 def _by_id(value: Any) -> bool:
     """Whether it is an array of tables that have ids."""
-    return isinstance(value, list) and bool(value) and all(isinstance(item, dict) and "id" in item for item in value)
+    return isinstance(value, list) and all(isinstance(item, dict) and "id" in item for item in value)
 
 
 def apply_override(data: dict[str, Any], override: str) -> None:
