@@ -27,7 +27,7 @@ Mask = NDArray[np.bool_]
 Rule = Literal["trace", "logdet", "info", "pinv_guard"]
 
 ITERATIONS = 25
-"""Within one percent of the optimum, as tests say."""
+"""The trace is within two percent of the least one then, mostly within a thousandth."""
 
 RANK = 1e-9
 """Eigenvalues of an information below this share of its largest one are rounding, not information."""
@@ -41,10 +41,12 @@ def weighed(
 ) -> tuple[Array, Array]:
     """Intersection of a prior (..., n, n) with informations (..., m, n, n), of which `used` (..., m) are there.
 
-    `staged`: informations are weighed among themselves first. Returns (cov (..., n, n), weights (..., 1 + m)), that of
-    the prior first. Raises `numpy.linalg.LinAlgError` for a prior that is indefinite.
+    `staged`: informations are weighed among themselves first. What is not `used` may be any numbers. Returns (cov
+    (..., n, n), weights (..., 1 + m)), that of the prior first. Raises `numpy.linalg.LinAlgError` for a prior that is
+    indefinite.
     """
-    used = used & (_trace(informations) > 0.0)
+    lead = np.broadcast_shapes(prior.shape[:-2], informations.shape[:-3], used.shape[:-1])
+    used = np.broadcast_to(used & (_trace(informations) > 0.0), (*lead, used.shape[-1]))
     root = square_root(prior)
     # In the prior's own metric it is the identity: P = L (w_0 I + sum w_l A_l)^-1 L^T with A = L^T S L.
     whitened = root.swapaxes(-1, -2)[..., None, :, :] @ informations @ root[..., None, :, :]
@@ -92,6 +94,8 @@ def _least(root: Array, whitened: Array, used: Mask, rule: Rule) -> Array:
             inverse = inverse @ metric @ inverse
         slope[..., 0] = _trace(inverse)
         slope[..., 1:] = (flat @ inverse.reshape(*lead, n * n, 1))[..., 0]
+        # A prior without any error has no slope at all.
+        np.maximum(slope, LEAST, out=slope)
         weights = weights * (np.sqrt(slope) if rule == "trace" else slope)
         weights /= weights.sum(axis=-1, keepdims=True)
     return weights
@@ -103,16 +107,15 @@ def _by_size(prior: Array, informations: Array, used: Mask, rule: Rule, staged: 
         of_prior, of_each = _trace(np.linalg.pinv(prior, hermitian=True)), _trace(informations)
     else:
         of_prior, of_each = _trace(prior), _trace(_pseudo_inverse(informations))
+    own = np.broadcast_to(of_prior, used.shape[:-1])[..., None]
+    always = np.ones_like(own, dtype=bool)
     if not staged:
-        there = np.concatenate([np.ones_like(used[..., :1]), used], axis=-1)
-        return _shares(np.concatenate([np.broadcast_to(of_prior, used.shape[:-1])[..., None], of_each], axis=-1), there)
+        return _shares(np.concatenate([own, of_each], axis=-1), np.concatenate([always, used], axis=-1))
     eta = _shares(of_each, used)
     together = np.sum(eta[..., None, None] * informations, axis=-3)
-    of_all = _trace(together if rule == "info" else _pseudo_inverse(together))
-    zeta = _shares(
-        np.stack([np.broadcast_to(of_prior, of_all.shape), of_all], axis=-1),
-        np.stack([np.ones_like(used.any(axis=-1)), used.any(axis=-1)], axis=-1),
-    )
+    of_all = _trace(together if rule == "info" else _pseudo_inverse(together))[..., None]
+    some = used.any(axis=-1, keepdims=True)
+    zeta = _shares(np.concatenate([own, of_all], axis=-1), np.concatenate([always, some], axis=-1))
     return np.concatenate([zeta[..., :1], zeta[..., 1:] * eta], axis=-1)
 
 
