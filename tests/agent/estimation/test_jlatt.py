@@ -277,7 +277,7 @@ def own_belief(observer: StateLayout) -> tuple[Array, Array]:
     mean, sigma = np.zeros(observer.dim), np.full(observer.dim, 0.02)
     mean[:2], sigma[:2] = [1.0, -2.0], 0.2
     if observer.altitude is not None:
-        mean[2], sigma[2] = 3.0, 0.1
+        mean[2], sigma[2] = 6.0, 0.1
     assert observer.heading is not None
     mean[observer.heading], sigma[observer.heading] = 2.9, 0.05
     mix = np.eye(observer.dim) + 0.3 * np.random.default_rng(1).normal(size=(observer.dim, observer.dim))
@@ -302,7 +302,7 @@ def test_a_place_and_its_parts_agree_with_drawn_errors(
     mean, cov = own_belief(observer)
     target = seen_target(subject, mean, observer.heading)
     z, R = model.h(np.concatenate([mean, target])), np.diag([0.01, 0.0004])
-    variance = 0.04 if subject.altitude is not None else 0.0
+    variance = 0.25 if subject.altitude is not None else 0.0
     # What else is believed of the place does not matter.
     believed = target.copy()
     believed[:2] += [3.0, -2.0]
