@@ -175,7 +175,9 @@ class RoundFusion:
 
     def correction(self, target: str, seen: Seen, own: Moment, track: Moment, t_ns: int) -> Correction | None:
         """Where an own measurement places a target at `t_ns`; None if it alone does not tell."""
-        found = target_correction(seen.model, own.mean, own.cov, track.mean, seen.z, seen.R)
+        altitude = seen.model.subject.altitude
+        variance = 0.0 if altitude is None else float(track.cov[altitude, altitude])
+        found = target_correction(seen.model, own.mean, own.cov, track.mean, seen.z, seen.R, variance)
         if found is None:
             self._counters["round.undetermined"] += 1
             return None
@@ -263,13 +265,17 @@ class RoundFusion:
                 yield peer, (Moment(t_ns, *moved), item.t_ns - belief.age_ns)
 
     def _placed(self, target: str, before: Moment, t_ns: int, told: dict[str, Told]) -> Iterator[tuple[str, Placed]]:
-        """By peer, where it places a target; the sensor's part counts as new once only."""
+        """By peer, where it places a target in x, y; the sensor's part counts as new once only.
+
+        What is of a former round is in what neighbours who heard it in time believe now.
+        """
+        near = t_ns - self._settings.round.period_ns // 2
         for peer, item in told.items():
             for found in item.report.corrections:
-                if found.target != target or len(found.place) > len(before.mean):
+                if found.target != target:
                     continue
-                placed = Placed(found.place, found.sensor, found.pose)
+                placed = Placed(found.place[:2], found.sensor[:2, :2], found.pose[:2, :2])
                 before_life = self.used_until_ns is not None and item.t_ns <= self.used_until_ns
-                if before_life or self._used.get(peer) == item.t_ns:
+                if before_life or item.t_ns < near or self._used.get(peer) == item.t_ns:
                     placed = placed.used()
                 yield peer, self._carrier.placed(target, placed, before, t_ns - item.t_ns)

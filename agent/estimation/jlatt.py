@@ -184,7 +184,7 @@ def predicted_target_cov(priors: Array, sensor: Array, pose: Array, seen: Mask, 
     """
     cov = priors[..., 0, :, :]
     if priors.shape[-3] > 1:
-        cov, _ = _together(cov, np.linalg.inv(priors[..., 1:, :, :]), weights)
+        cov, _ = _together(cov, np.asarray(np.linalg.inv(priors[..., 1:, :, :])), weights)
     H = np.broadcast_to(np.eye(2, cov.shape[-1]), (*sensor.shape[:-1], cov.shape[-1]))
     return predicted_robot_cov(cov, H, sensor, pose, seen, weights)
 
@@ -243,7 +243,7 @@ def _split_step(cov: Array, H: Array, noise: Array, other: Array) -> tuple[Array
     cov (..., n, n), H (..., m, n), noise (..., m, m), other (..., m, m); where that is zero, the update is Kalman's.
     """
     cross = cov @ H.swapaxes(-1, -2)
-    alone = ~other.any(axis=(-2, -1))[..., None]
+    alone = np.asarray(~other.any(axis=(-2, -1)))[..., None]
     by_own, by_other = np.where(alone, 1.0, 1.0 / GRID), np.where(alone, 1.0, 1.0 / (1.0 - GRID))
     S = by_own[..., None, None] * (H @ cross)[..., None, :, :] + noise[..., None, :, :]
     S += by_other[..., None, None] * other[..., None, :, :]

@@ -30,7 +30,10 @@ ITERATIONS = 25
 """The trace is within two percent of the least one then, mostly within a thousandth."""
 
 RANK = 1e-9
-"""Eigenvalues of an information below this share of its largest one are rounding, not information."""
+"""Eigenvalues of a product below this share of its largest one are rounding, not information."""
+
+ROUNDING = 1e-15
+"""The same of a covariance that was stored as such; its components have units of their own."""
 
 LEAST = 1e-300
 """A size that is divided by instead of zero."""
@@ -55,9 +58,9 @@ def weighed(
         weights = _least(root, whitened, used, rule)
     else:
         weights = _by_size(prior, np.where(used[..., None, None], informations, 0.0), used, rule, staged)
-    inverse = np.linalg.inv(_sum(weights, whitened))
+    inverse = np.asarray(np.linalg.inv(_sum(weights, whitened)))
     cov = symmetrize(root @ inverse @ root.swapaxes(-1, -2))
-    kept = ~used.any(axis=-1)
+    kept = np.asarray(~used.any(axis=-1))
     if rule == "logdet":
         kept = kept | ~(np.linalg.slogdet(inverse)[1] < 0.0)
     elif rule != "info":
@@ -89,7 +92,7 @@ def _least(root: Array, whitened: Array, used: Mask, rule: Rule) -> Array:
     weights /= weights.sum(axis=-1, keepdims=True)
     slope = np.empty_like(weights)
     for _ in range(ITERATIONS):
-        inverse = np.linalg.inv(_sum(weights, whitened))
+        inverse = np.asarray(np.linalg.inv(_sum(weights, whitened)))
         if rule == "trace":
             inverse = inverse @ metric @ inverse
         slope[..., 0] = _trace(inverse)
@@ -104,7 +107,7 @@ def _least(root: Array, whitened: Array, used: Mask, rule: Rule) -> Array:
 def _by_size(prior: Array, informations: Array, used: Mask, rule: Rule, staged: bool) -> Array:
     """Weights (..., 1 + m) that fall with the size of what is weighed (Su 2022, eq. 2.5)."""
     if rule == "info":
-        of_prior, of_each = _trace(np.linalg.pinv(prior, hermitian=True)), _trace(informations)
+        of_prior, of_each = _trace(_pseudo_inverse(prior, ROUNDING)), _trace(informations)
     else:
         of_prior, of_each = _trace(prior), _trace(_pseudo_inverse(informations))
     own = np.broadcast_to(of_prior, used.shape[:-1])[..., None]
@@ -119,8 +122,8 @@ def _by_size(prior: Array, informations: Array, used: Mask, rule: Rule, staged: 
     return np.concatenate([zeta[..., :1], zeta[..., 1:] * eta], axis=-1)
 
 
-def _pseudo_inverse(informations: Array) -> Array:
-    return np.asarray(np.linalg.pinv(informations, rcond=RANK, hermitian=True))
+def _pseudo_inverse(matrices: Array, rank: float = RANK) -> Array:
+    return np.asarray(np.linalg.pinv(matrices, rcond=rank, hermitian=True))
 
 
 def _shares(sizes: Array, there: Mask) -> Array:
