@@ -115,7 +115,7 @@ class TargetForecast:
 
     place (2,), place_cov (2, 2)  at k, by the robot's belief
     track (t1 + 1, 2)  where it is at k ... k + t1
-    priors (j, n, n)  covariances at k of all who believe something of it
+    prior (n, n)  covariance at k of what all believe of it together
     sensor, pose (j - 1 or j, 2, 2), seen (j - 1 or j,)  what the others will see of it
     growth (n, n), noise  tr P(k + t2) = <growth, P(k)> + noise
     """
@@ -123,7 +123,7 @@ class TargetForecast:
     place: Array
     place_cov: Array
     track: Array
-    priors: Array
+    prior: Array
     sensor: Array
     pose: Array
     seen: NDArray[np.bool_]
@@ -187,7 +187,7 @@ class Prediction:
             start.mean[:2],
             start.cov[:2, :2],
             np.array(track[: settings.ahead + 1]),
-            np.array([item.cov for item in ahead]),
+            _together([item.cov for item in ahead], settings),
             seen.sensor[:, 0],
             seen.pose_part(self.others.covs[seers])[:, 0],
             seen.seen[:, 0],
@@ -211,7 +211,7 @@ class Prediction:
         nearest = np.inf
         for index, target in enumerate(self.targets, start=len(self.others.poses)):
             cov = predicted_target_cov(
-                target.priors,
+                target.prior[None],
                 _with_own(sight.sensor[:, index], target.sensor),
                 _with_own(pose_part[:, index], target.pose),
                 _with_own(sight.seen[:, index], target.seen),
@@ -222,6 +222,12 @@ class Prediction:
             if distance < nearest:
                 nearest, off_nose = distance, np.abs(sight.bearings[:, index])
         return Predicted(own_trace, targets, new.track[:, : settings.ahead + 1], off_nose)
+
+
+def _together(covs: list[Array], settings: PlanningSettings) -> Array:
+    """Covariance (n, n) of beliefs with `covs` (n, n) together, the robot's own first, without any sightings."""
+    none = np.zeros((0, 2, 2))
+    return predicted_target_cov(np.array(covs), none, none, np.zeros(0, dtype=bool), settings.weights)
 
 
 def _with_own(own: NDArray[Scalar], others: NDArray[Scalar]) -> NDArray[Scalar]:
