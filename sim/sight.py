@@ -83,6 +83,11 @@ def _ranges_peers(robot: RobotPart) -> bool:
     )
 
 
+def steps_between(sensor: SensorPart, step_s: float) -> int:
+    """Steps from one measurement of a sensor to the next."""
+    return 1 if sensor.rate_hz is None else max(1, round(1.0 / (sensor.rate_hz * step_s)))
+
+
 def reach_m(sensor: SensorPart) -> float:
     """How far a subject of a sensor may be from its robot: the lever arm comes on top of the range."""
     if sensor.max_range_m is None:
