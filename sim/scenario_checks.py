@@ -158,12 +158,13 @@ def _check_planning(scenario: Scenario) -> None:
     try:
         scenario.round.settings()
         for robot in scenario.robots:
-            planning = scenario.planning_of(robot)
-            if planning.radio_range_m is None:
+            planning, source = scenario.planning_of(robot), ""
+            if planning.radio_range_m is None and scenario.links.range_m is not None:
                 planning = planning.model_copy(update={"radio_range_m": scenario.links.range_m})
+                source = "; planning.radio_range_m is not stated, which is links.range_m then"
             planning.settings()
     except ConfigError as error:
-        raise ConfigError(f"{scenario.name}: {error}") from None
+        raise ConfigError(f"{scenario.name}: {error}{source}") from None
     for robot in scenario.robots:
         vehicle, where = robot.vehicle, f"{scenario.name}: robots.{robot.id}"
         if vehicle.min_speed_mps > vehicle.max_speed_mps:

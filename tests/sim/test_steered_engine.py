@@ -63,7 +63,7 @@ def faulty(*faults: dict[str, Any], **change: Any) -> Scenario:
 
 def test_robots_go_where_they_believe_the_origin_to_be(monkeypatch: pytest.MonkeyPatch) -> None:
     made = scenario()
-    world, result = Steered(monkeypatch).play(made)
+    _, result = Steered(monkeypatch).play(made)
     for robot in ("r1", "r2"):
         mean = result.trace.robots[robot].mean[-30:]
         assert np.linalg.norm(mean[:, :2], axis=1).max() < 1.0
@@ -97,7 +97,9 @@ def test_a_command_within_a_step_counts_from_then_on(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize(
-    "fault", [{"kind": "crash", "robot": "r1", "at_s": 9.7}, {"kind": "pause", "robot": "r1", "at_s": 9.7, "for_s": 9.0}]
+    "fault",
+    [{"kind": "crash", "robot": "r1", "at_s": 9.7}, {"kind": "pause", "robot": "r1", "at_s": 9.7, "for_s": 9.0}],
+    ids=("crash", "pause"),
 )
 def test_the_vehicle_of_a_robot_that_is_down_stops_when_its_command_expires(
     monkeypatch: pytest.MonkeyPatch, fault: dict[str, Any]
