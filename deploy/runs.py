@@ -32,6 +32,7 @@ from sim.engine import TrialResult
 from sim.invariants import InvariantBreach, InvariantChecker
 from sim.scenario import Scenario
 from sim.scenario_file import load
+from sim.sight import views
 from sim.store import load_trace, save_trace
 from sim.summary import reduce, summarize, unmet
 from sim.trial import open_world, played_world, run_trial
@@ -102,7 +103,7 @@ def run(options: argparse.Namespace) -> int:
         timing=timing,
         exits=exits,
     )
-    save_trace(run_dir, result.trace, result.contacts, world.landmarks, result.measured)
+    save_trace(run_dir, result.trace, result.contacts, world.landmarks, result.measured, views(scenario))
     report = write_results(scenario, run_dir, summary, options.arguments, draw=not options.no_report)
     if options.json:
         print(json.dumps(summary, allow_nan=False))

@@ -155,6 +155,7 @@ UNMIXED = {
 
 def _check_planning(scenario: Scenario) -> None:
     """Robots that choose their motion do so in a simulated world, and are not driven by anything else."""
+    source = ""
     try:
         scenario.round.settings()
         for robot in scenario.robots:
