@@ -36,7 +36,6 @@ from agent.config_parts import (
     MotionPart,
     MountVector,
     NetworkPart,
-    OdometryPart,
     SensorKind,
     StatePart,
     TeamMemberPart,
@@ -46,6 +45,8 @@ from agent.estimation.mounting import mount_of
 from agent.fault_parts import FaultPart
 from agent.joint_room import check_room
 from agent.mavlink import MavlinkEndpointError, parse_endpoint
+from agent.motion_parts import OdometryPart
+from agent.planning_parts import PlanningPart, RoundPart
 from agent.sensor_input import SensorConfig
 from agent.settings import AgentSettings, nanoseconds
 from agent.start_config import InitialPart, check_start
@@ -164,6 +165,8 @@ class AgentConfig(Part):
     tracking: TrackingPart = TrackingPart()
     lateness: LatenessPart = LatenessPart()
     health: HealthPart = HealthPart()
+    round: RoundPart = RoundPart()
+    planning: PlanningPart = PlanningPart()
     unsafe: UnsafePart = UnsafePart()
     coast: CoastPart = CoastPart()
     network: NetworkPart = NetworkPart()
@@ -217,6 +220,8 @@ class AgentConfig(Part):
             localization=localization,
             lateness=lateness,
             health=health,
+            round=self.round.settings(),
+            planning=self.planning.settings(),
             unsafe=unsafe,
             coast=coast,
             track=self.tracking.kind != "none",
@@ -271,6 +276,8 @@ def load_agent_config(path: Path) -> AgentConfig:
         raise ConfigError(f"{path}: {error}") from None
     try:
         config.health.settings(config.localization.form)
+        config.round.settings()
+        config.planning.settings()
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     if config.localization.kind == "replica" and not config.team:

@@ -25,6 +25,7 @@ from sim.engine import TrialResult, network_figures
 from sim.fault_plan import trial_faults
 from sim.faulty_world import FaultyWorld
 from sim.metrics import TrialTrace
+from sim.motion_figures import trial_motion
 from sim.sampling import MeasurementLog, Sampler
 from sim.scenario import Scenario
 from sim.world import World
@@ -65,6 +66,7 @@ def collect(
             if row_index is not None:
                 for entity in (*world.robots, *world.targets):
                     sampler.put_bound(entity, row_index, runner.belief(entity))
+    instants = measured.instants()
     return TrialResult(
         sampler.trace(),
         contacts,
@@ -72,7 +74,8 @@ def collect(
         dict(sorted(rejected.items())),
         nis,
         counters,
-        measured=measured.instants(),
+        trial_motion(scenario, world, instants, world.steps),
+        measured=instants,
     )
 
 

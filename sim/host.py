@@ -32,6 +32,7 @@ from agent.settings import nanoseconds
 from network.link_feed import LinkFeed
 from sim.agents import autopilot_fix
 from sim.autopilot import StandIn, StandInServer
+from sim.closed_loop import MotionWriter
 from sim.fault_plan import trial_faults
 from sim.faulty_world import FaultyWorld
 from sim.reach import Reach
@@ -39,7 +40,7 @@ from sim.scenario import RobotPart
 from sim.scenario_file import load
 from sim.trial import open_world
 from sim.vehicle_telemetry import StandInSettings
-from sim.world import Output
+from sim.world import Output, SimulatedWorld
 
 VEHICLES = {False: dialect.MAV_TYPE_GROUND_ROVER, True: dialect.MAV_TYPE_QUADROTOR}
 BOOT_LEAD_NS = 30_000_000_000
@@ -58,6 +59,8 @@ class HostPlan:
     link_endpoint: str
     mavlink_ports: dict[str, int]
     sensor_sockets: dict[str, str]
+    motion: str
+    """The file for the motion of robots that choose it: nobody else can tell it afterwards."""
     namespaces: dict[str, str] = field(default_factory=dict)
     """Network namespaces of robots that have one of their own: their stand-ins speak there."""
 
@@ -99,7 +102,12 @@ class WorldHost:
         self._scenario = load(plan.scenario)
         self._fixes = {robot.id: autopilot_fix(robot) for robot in self._scenario.robots}
         # A silent autopilot goes on moving: it is the stand-in that says nothing.
-        self._world = FaultyWorld(open_world(self._scenario, plan.seed), plan.seed, self._fixes, drop_silenced=False)
+        world = open_world(self._scenario, plan.seed)
+        self._world = FaultyWorld(world, plan.seed, self._fixes, drop_silenced=False)
+        self._motion: MotionWriter | None = None
+        if isinstance(world, SimulatedWorld) and world.closed_loop:
+            self._motion = MotionWriter(Path(plan.motion), world.motion)
+            self._motion.add(0)
         self._clocks: dict[str, FaultyClock] = {robot.id: FaultyClock() for robot in self._scenario.robots}
         links = self._scenario.links
         self._reach = None if links.range_m is None else Reach(self._world, links.range_m, links.hysteresis_m)
@@ -144,6 +152,8 @@ class WorldHost:
             for server in self._servers.values():
                 await server.close()
             self._socket.close()
+            if self._motion is not None:
+                self._motion.close()
             await control.close()
             with contextlib.suppress(TimeoutError):
                 await self._feed.close()
@@ -200,18 +210,28 @@ class WorldHost:
         groups: dict[int, list[Output]] = {}
         for k in range(1, world.steps + 1):
             end = k * world.step_ns
+            if self._motion is not None:
+                # Vehicles are where they have been told to go until now.
+                await self._emit_until(k, clock, groups, end - 1)
+                await self._until(clock, clock.t0_ns + end)
             for item in world.outputs(k):
                 groups.setdefault(item.t_ns + item.late_ns, []).append(item)
-            for t_ns in sorted(t_ns for t_ns in groups if t_ns <= end):
-                items = groups.pop(t_ns)
-                await self._until(clock, clock.t0_ns + t_ns)
-                if t_ns == end:
-                    self._publish_reach(k, clock.t0_ns + end)
-                self._emit(k, clock.t0_ns, items)
+            if self._motion is not None:
+                self._motion.add(k)
+            await self._emit_until(k, clock, groups, end)
             if k % 10 == 0:
                 control.say({"status": {"progress": k / world.steps}})
         # The last instant settles and its exchanges end before the agents are stopped.
         await asyncio.sleep(FINAL_WALL_S + clock.wall_s(2 * world.step_ns) / 2)
+
+    async def _emit_until(self, k: int, clock: FleetClock, groups: dict[int, list[Output]], end: int) -> None:
+        """What reaches robots until `end`, each datum in its time."""
+        for t_ns in sorted(t_ns for t_ns in groups if t_ns <= end):
+            items = groups.pop(t_ns)
+            await self._until(clock, clock.t0_ns + t_ns)
+            if t_ns == k * self._world.step_ns:
+                self._publish_reach(k, clock.t0_ns + t_ns)
+            self._emit(k, clock.t0_ns, items)
 
     async def _until(self, clock: FleetClock, t_ns: int) -> None:
         wait_s = clock.wall_s(t_ns - clock.now_ns())

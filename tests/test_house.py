@@ -35,6 +35,9 @@ PURE = (
     "agent/frames.py",
     *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "agent" / "estimation").glob("*.py"))),
     "sim/world.py",
+    "sim/motion.py",
+    "sim/vehicle.py",
+    "sim/motion_figures.py",
     "sim/sight.py",
     "sim/noise.py",
     "sim/metrics.py",
@@ -44,6 +47,7 @@ CONFIG_ONLY = (
     "agent/config_file.py",
     "agent/config_parts.py",
     "agent/fault_parts.py",
+    "agent/planning_parts.py",
     "agent/start_config.py",
     "sim/scenario.py",
 )

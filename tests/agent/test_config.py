@@ -13,16 +13,11 @@ import tomli_w
 
 from agent.config import AgentConfig, load_agent_config
 from agent.config_file import ConfigError, validate
-from agent.config_parts import (
-    ControlNoisePart,
-    ControlPart,
-    LocalizationPart,
-    OdometryPart,
-    SigmaPart,
-)
+from agent.config_parts import LocalizationPart, SigmaPart
 from agent.estimation.motion import SPATIAL, HeldAltitude, SpatialMotion
 from agent.estimation.mounting import planar_mount
 from agent.estimation.observation import Intrinsics
+from agent.motion_parts import ControlNoisePart, ControlPart, OdometryPart
 from agent.settings import AgentSettings, CoastSettings, UnsafeSettings
 from agent.target_parts import target_motion
 from agent.unsafe_parts import UnsafePart

@@ -23,16 +23,9 @@ import tomli_w
 from pydantic import BaseModel
 
 from agent.config import AgentConfig, load_agent_config
-from agent.config_parts import (
-    CalibrationPart,
-    ControlNoisePart,
-    ControlPart,
-    IntrinsicsPart,
-    LinksPart,
-    OdometryPart,
-    SigmaPart,
-)
+from agent.config_parts import CalibrationPart, IntrinsicsPart, LinksPart, SigmaPart
 from agent.events import Observation
+from agent.motion_parts import ControlNoisePart, ControlPart, OdometryPart
 from agent.sensor_input import ABSOLUTE_KINDS, SIZES, decode
 from deploy.cli import main, parser
 from network.wire_fields import REASONS
