@@ -27,7 +27,9 @@ class RoundPart(Part):
                 f"round.wait_s = {self.wait_s:g} is not below round.period_s = {self.period_s:g}: a round would not "
                 "end before the next begins; shorten it"
             )
-        return RoundSettings(nanoseconds(self.period_s), nanoseconds(self.wait_s), self.lean)
+        return RoundSettings(
+            period_ns=nanoseconds(self.period_s), wait_ns=nanoseconds(self.wait_s), lean=self.lean
+        )
 
 
 class SensingPart(Part):
