@@ -220,7 +220,8 @@ class AgentConfig(Part):
             localization=localization,
             lateness=lateness,
             health=health,
-            round=self.round.settings(),
+            # In a run all clocks begin at the same instant; in the field the epoch is what all have in common.
+            round=self.round.settings(start_ns if self.clock.source == "run" else 0),
             planning=self.planning.settings(),
             unsafe=unsafe,
             coast=coast,

@@ -20,15 +20,15 @@ class RoundPart(Part):
     wait_s: Positive = 0.2
     lean: bool = False
 
-    def settings(self) -> RoundSettings:
-        """Raises `ConfigError` for rounds that do not end before the next one."""
+    def settings(self, anchor_ns: int = 0) -> RoundSettings:
+        """Rounds counted from `anchor_ns`. Raises `ConfigError` for rounds that do not end before the next one."""
         if self.wait_s >= self.period_s:
             raise ConfigError(
                 f"round.wait_s = {self.wait_s:g} is not below round.period_s = {self.period_s:g}: a round would not "
                 "end before the next begins; shorten it"
             )
         return RoundSettings(
-            period_ns=nanoseconds(self.period_s), wait_ns=nanoseconds(self.wait_s), lean=self.lean
+            nanoseconds(self.period_s), anchor_ns, nanoseconds(self.wait_s), self.lean
         )
 
 

@@ -112,7 +112,7 @@ def planning_table(scenario: Scenario, seed: int, robot: RobotPart) -> dict[str,
             "min_range_m": camera.min_range_m,
             "max_range_m": camera.max_range_m or FAR_M,
             "fov_rad": camera.fov_rad or 2.0 * math.pi,
-            "sigma_m": camera.sigma_m,
+            "sigma_m": camera.sigma_m or 0.0,
             "sigma_m_per_m": camera.sigma_m_per_m,
             "sigma_rad": camera.sigma_rad,
         }

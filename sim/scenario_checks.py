@@ -232,7 +232,8 @@ def check_sensor(where: str, name: str, sensor: SensorPart) -> None:
         raise ConfigError(f"{where}: state its kind, one of {', '.join(KINDS)}")
     needs_m = kind in ("range", "range_bearing", "vector", "position", "pose")
     needs_rad = kind in ("bearing", "bearing3", "range_bearing", "pose", "heading")
-    if needs_m and sensor.sigma_m is None:
+    grows = sensor.sigma_m_per_m > 0.0 and sensor.min_range_m > 0.0 and kind in RELATIVE_ANGLES
+    if needs_m and sensor.sigma_m is None and not grows:
         raise ConfigError(f"{where}: sigma_m is missing")
     if needs_rad and sensor.sigma_rad is None:
         raise ConfigError(f"{where}: sigma_rad is missing")

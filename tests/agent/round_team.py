@@ -31,6 +31,11 @@ TARGET_SPEED = 0.25
 SIGMA_START = np.array([0.1, 0.1, 0.01])
 SIGMA_TARGET = np.array([5.0, 5.0, 1.0])
 
+JLATT = LocalizationSettings(kind="jlatt", weights="trace", transform="jacobian")
+POTENTIAL = PlanningSettings(kind="potential", form="published")
+ROUND = RoundSettings()
+LATENESS = LatenessSettings(horizon_ns=10 * NS)
+
 Carry = Callable[[int, str, str, RoundStage, int], int | None]
 """Rounds of delay of what the first robot tells the second in a round, or None: lost."""
 
@@ -44,10 +49,10 @@ class Team:
     """Robots of Su 2022, chapter 4, and the errors they make: arrays (steps, robots, ...)."""
 
     seed: int
-    localization: LocalizationSettings = LocalizationSettings(kind="jlatt", weights="trace", transform="jacobian")
-    planning: PlanningSettings = PlanningSettings(kind="potential", form="published")
-    round: RoundSettings = RoundSettings()
-    lateness: LatenessSettings = LatenessSettings(horizon_ns=10 * NS)
+    localization: LocalizationSettings = JLATT
+    planning: PlanningSettings = POTENTIAL
+    round: RoundSettings = ROUND
+    lateness: LatenessSettings = LATENESS
     robots: int = 6
     carry: Carry = at_once
     agents: dict[str, Agent] = field(default_factory=dict)
@@ -84,7 +89,7 @@ class Team:
                     lateness=self.lateness,
                 )
             )
-        self.commands = {name: (0.0, 0.0) for name in self.names}
+        self.commands = dict.fromkeys(self.names, (0.0, 0.0))
         self.seq = 0
         self.waiting: list[tuple[int, str, Received]] = []
         for name in self.names:
@@ -106,7 +111,7 @@ class Team:
         for peer in self.names:
             if peer == name:
                 continue
-            stage = getattr(effect.body, "stage")
+            stage = effect.body.stage
             delay = self.carry(k, name, peer, stage, self.seq)
             if delay == 0:
                 self.hand(k, peer, Received(t_ns, message))
@@ -182,5 +187,5 @@ class Team:
 
     def rmse(self) -> tuple[float, float]:
         """Of the target's and the robots' places over time [m]."""
-        found = [np.sqrt(np.mean(np.sum(np.array(e)[..., :2] ** 2, axis=-1))) for e in (self.target_errors, self.errors)]
-        return float(found[0]), float(found[1])
+        of_target, own = (np.array(e)[..., :2] for e in (self.target_errors, self.errors))
+        return float(np.sqrt(np.mean(np.sum(of_target**2, -1)))), float(np.sqrt(np.mean(np.sum(own**2, -1))))
