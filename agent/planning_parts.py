@@ -77,12 +77,15 @@ class PlanningPart(Part):
     weights: RoundWeights = PLAIN.weights
     sensing: SensingPart | None = None
     seed: Annotated[int, Field(ge=0, lt=2**63)] | None = None
+    overrun_s: Positive | None = None
 
     def settings(self) -> PlanningSettings:
         """Raises `ConfigError` for distances that do not go together, of the kinds that use them."""
         stated: dict[str, Any] = {
-            key: value for key, value in self.model_dump(exclude={"sensing"}).items() if value is not None
+            key: value for key, value in self.model_dump(exclude={"sensing", "overrun_s"}).items() if value is not None
         }
+        if self.overrun_s is not None:
+            stated["overrun_ns"] = nanoseconds(self.overrun_s)
         if self.sensing is not None:
             stated["sensing"] = self.sensing.settings()
         settings = PlanningSettings(**stated)

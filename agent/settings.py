@@ -96,6 +96,7 @@ class PlanningSettings:
     candidates       most commands that `optimal` evaluates per round
     weights          the rule of the corrections that `optimal` predicts
     seed             of the kind `random`
+    overrun_ns       a plan that takes longer took too long
     """
 
     kind: Literal["none", "random", "potential", "optimal"] = "none"
@@ -116,6 +117,7 @@ class PlanningSettings:
     weights: RoundWeights = "split_ci"
     sensing: SensingSettings = SensingSettings()
     seed: int = 0
+    overrun_ns: int = NS // 2
 
 
 @dataclass(frozen=True, slots=True)
