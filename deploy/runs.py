@@ -86,6 +86,8 @@ def run(options: argparse.Namespace) -> int:
         write_scenario(scenario, run_dir)
         world = played_world(scenario, options.seed, run_dir / MOTION)
         result = collect(scenario, world, run_dir, outcome, options.bound, options.seed)
+        for figures in outcome.figures.values():
+            result.plan_us.extend(figures["plan_us"] if figures else ())
         merge_recordings(scenario, run_dir)
         merge_fates(scenario, run_dir)
     steps = sorted(result.step_us)

@@ -15,12 +15,11 @@ import signal
 import socket
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from agent.clock_faults import FaultyClock
 from agent.control import ControlLine
@@ -39,10 +38,9 @@ from sim.reach import Reach
 from sim.scenario import RobotPart
 from sim.scenario_file import load
 from sim.trial import open_world
-from sim.vehicle_telemetry import StandInSettings
+from sim.vehicle_telemetry import VEHICLES, StandInSettings
 from sim.world import Output, SimulatedWorld
 
-VEHICLES = {False: dialect.MAV_TYPE_GROUND_ROVER, True: dialect.MAV_TYPE_QUADROTOR}
 BOOT_LEAD_NS = 30_000_000_000
 FINAL_WALL_S = 0.5
 CLONE_NEWNET = 0x40000000
@@ -192,6 +190,8 @@ class WorldHost:
                 boot_ns=clock.t0_ns - BOOT_LEAD_NS,
                 vehicle_type=VEHICLES[LAYOUTS[part.model].altitude is not None],
                 own_fixes=self._fixes[robot] is not None,
+                armed=part.autopilot.armed,
+                mode=part.autopilot.mode,
             )
             server = StandInServer(StandIn(settings), f"udpout:127.0.0.1:{port}", clock)
             with inside(self._plan.namespaces.get(robot)):
@@ -214,6 +214,7 @@ class WorldHost:
                 # Vehicles are where they have been told to go until now.
                 await self._emit_until(k, clock, groups, end - 1)
                 await self._until(clock, clock.t0_ns + end)
+                self._steer(clock.t0_ns, end)
             for item in world.outputs(k):
                 groups.setdefault(item.t_ns + item.late_ns, []).append(item)
             if self._motion is not None:
@@ -232,6 +233,12 @@ class WorldHost:
             if t_ns == k * self._world.step_ns:
                 self._publish_reach(k, clock.t0_ns + t_ns)
             self._emit(k, clock.t0_ns, items)
+
+    def _steer(self, t0_ns: int, end: int) -> None:
+        """What the autopilots were told until `end`, from the arrival of each command on."""
+        for robot in self._scenario.planners():
+            for t_ns, steer in self._servers[robot.id].stand_in.control.commands(t0_ns + end):
+                self._world.steer(robot.id, t_ns - t0_ns, replace(steer, until_ns=steer.until_ns - t0_ns))
 
     async def _until(self, clock: FleetClock, t_ns: int) -> None:
         wait_s = clock.wall_s(t_ns - clock.now_ns())

@@ -149,10 +149,14 @@ class VehiclePart(Part):
 
 
 class AutopilotPart(Part):
-    """What the vehicle's autopilot sends. A GPS-denied one sends odometry in a drifting local frame only."""
+    """What the vehicle's autopilot sends: a GPS-denied one odometry in a drifting local frame only. How it is found at
+    the start: `mode` is a flight mode of its flavour, `GUIDED` for instance; absent: one that a person drives in.
+    """
 
     sends: list[Literal["odometry", "global_position", "attitude"]] = ["odometry", "attitude"]
     flavour: Literal["ardupilot", "px4"] = "ardupilot"
+    armed: bool = False
+    mode: str | None = None
 
 
 class RobotPart(Part):

@@ -13,6 +13,7 @@ from agent.joint_room import check_room
 from agent.motion_parts import ControlPart
 from agent.start_config import check_start
 from sim.scenario import KINDS, MIN_STEP_S, RobotPart, Scenario, SensorPart, TargetPart, sensor_kind, target_sensor
+from sim.vehicle_telemetry import VEHICLES, StandInSettings
 
 
 def check(scenario: Scenario) -> None:
@@ -55,6 +56,7 @@ def check(scenario: Scenario) -> None:
     check_schedule(scenario, scenario.faults)
     for robot in scenario.robots:
         _check_mover(f"{scenario.name}: robots.{robot.id}", robot)
+        _check_autopilot(f"{scenario.name}: robots.{robot.id}", robot)
         if recorded and LAYOUTS[robot.model].altitude is not None:
             raise ConfigError(
                 f"{scenario.name}: robots.{robot.id}.model = '{robot.model}' has an altitude, and recordings are "
@@ -100,6 +102,14 @@ def check(scenario: Scenario) -> None:
             )
         if not recorded and target.start.pose is None:
             raise ConfigError(f"{scenario.name}: targets.{target.id}.start.pose is missing")
+
+
+def _check_autopilot(where: str, robot: RobotPart) -> None:
+    vehicle_type = VEHICLES[LAYOUTS[robot.model].altitude is not None]
+    try:
+        StandInSettings(flavour=robot.autopilot.flavour, vehicle_type=vehicle_type, mode=robot.autopilot.mode)
+    except ValueError as error:
+        raise ConfigError(f"{where}.autopilot.{error}") from None
 
 
 def check_schedule(scenario: Scenario, faults: list[AnyFaultPart]) -> None:

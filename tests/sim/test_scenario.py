@@ -157,6 +157,8 @@ MISTAKES: list[tuple[str, list[str]]] = [
         "targets=[{id='t1',model='quadrotor',start_sigma={position_m=1.0,altitude_m=1.0,heading_rad=1.0}}]",
         ["targets.t1.noise", "altitude_m above 0"],
     ),
+    ("robots.r1.autopilot.mode=OFFBOARD", ["robots.r1.autopilot.mode: 'OFFBOARD'", "GUIDED"]),
+    ("robots.r1.autopilot={flavour='px4',mode='GUIDED'}", ["robots.r1.autopilot.mode: 'GUIDED'", "OFFBOARD"]),
     ("world.placement.reaches=r9", ["world.placement.reaches = 'r9'", "r1, r2, r3, r4"]),
     ('world={kind="recording"}', ["world.path is missing", "--set world.path="]),
     ('world={kind="simulated"}', ["robots.r1.start.circle", "[world.placement]"]),
