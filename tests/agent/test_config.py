@@ -390,3 +390,11 @@ def test_a_vehicle_is_steered_only_if_that_is_switched_on() -> None:
     assert steered.settings([0.0, 0.0, 0.0]).steering == SteeringSettings(arm=False, set_mode=False)
     told = MavlinkPart(endpoint="udpin:127.0.0.1:14550", steer=True, arm=True)
     assert told.settings([0.0, 0.0, 0.0]).steering == SteeringSettings(arm=True, set_mode=False)
+
+
+def test_what_is_planned_may_be_steered_by(tmp_path: Path) -> None:
+    mavlink = {"endpoint": "serial:/dev/ttyAMA0:921600", "steer": True}
+    planning = {"kind": "potential", "overrun_s": 0.25}
+    planned = load_agent_config(write(tmp_path, example(mavlink=mavlink, planning=planning)))
+    assert planned.settings(0).planning.overrun_ns == 250_000_000
+    assert planned.mavlink is not None and planned.mavlink.steer and not planned.mavlink.arm
