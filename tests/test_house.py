@@ -32,6 +32,9 @@ PURE = (
     "agent/settings.py",
     "agent/sensor_input.py",
     "agent/autopilot.py",
+    "agent/steering_link.py",
+    "agent/flight_modes.py",
+    "agent/plan_timer.py",
     "agent/frames.py",
     *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "agent" / "estimation").glob("*.py"))),
     "sim/world.py",
@@ -41,6 +44,7 @@ PURE = (
     "sim/sight.py",
     "sim/noise.py",
     "sim/metrics.py",
+    "sim/vehicle_control.py",
 )
 CONFIG_ONLY = (
     "agent/config.py",
