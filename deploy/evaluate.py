@@ -88,6 +88,8 @@ def _sampled(
     scenario: Scenario, world: World, run_dir: Path, t0_ns: int, seed: int, with_bound: bool
 ) -> tuple[Sampler, list[tuple[float, str, str]]]:
     """Estimates at sampled instants, and the contacts in order."""
+    if world.closed_loop:
+        raise ValueError("nobody but the run's world knows where its robots went: take `sim.trial.played_world`")
     clocks = Clocks(scenario, seed, t0_ns)
     measured = Measured(scenario, clocks)
     sampler = Sampler(scenario, world, with_bound)

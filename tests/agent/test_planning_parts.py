@@ -47,7 +47,7 @@ def test_what_is_stated_counts() -> None:
     expected: Any = stated | {"sensing": SensingSettings(1.0, 8.0, 1.0, 0.1, 0.0)}
     assert part.settings() == PlanningSettings(**expected)
     rounds = validate(RoundPart, {"period_s": 2.0, "wait_s": 0.5, "lean": True}, "round")
-    assert rounds.settings() == RoundSettings(2 * NS, NS // 2, True)
+    assert rounds.settings() == RoundSettings(period_ns=2 * NS, wait_ns=NS // 2, lean=True)
 
 
 @pytest.mark.parametrize(

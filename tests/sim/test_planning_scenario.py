@@ -76,7 +76,7 @@ def test_a_robot_may_have_planning_of_its_own() -> None:
 def test_rounds_are_those_of_the_scenario() -> None:
     scenario = made("round={period_s=2.0, wait_s=0.5, lean=true}")
     config = agent_config(scenario, open_world(scenario, 1), scenario.robots[0])
-    assert config.settings(0).round == RoundSettings(2_000_000_000, 500_000_000, True)
+    assert config.settings(0).round == RoundSettings(period_ns=2_000_000_000, wait_ns=500_000_000, lean=True)
 
 
 @pytest.mark.parametrize(

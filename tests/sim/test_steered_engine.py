@@ -24,14 +24,17 @@ HELD_NS = 3 * NS // 2
 
 
 class Steered:
-    """Robots r1 and r2 head for the origin as they believe it to be, told anew with every event of a kind."""
+    """Robots r1 and r2 head for the origin as they believe it to be, told anew with every event of a kind.
+
+    What they would choose themselves does not count.
+    """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, on: type = Odometry, held_ns: int = HELD_NS) -> None:
         self.speed = 0.3
         plain = Agent.handle
 
         def handle(agent: Agent, event: Event) -> list[Effect]:
-            effects = plain(agent, event)
+            effects = [effect for effect in plain(agent, event) if not isinstance(effect, Steer)]
             estimate = agent.estimate()
             if isinstance(event, on) and agent.settings.robot in ("r1", "r2") and estimate is not None:
                 x, y, heading = estimate.mean
