@@ -34,9 +34,8 @@ Array = NDArray[np.float64]
 PLACING = ("range_bearing", "vector")
 """Kinds of measurement that tell a place without knowing an altitude well."""
 
-ODDS = np.geomspace(0.1, 100.0, 12)
-GRID = ODDS / (1.0 + ODDS)
-"""Candidate weights of a split intersection; other robots often know less than the own belief, hence more near 1."""
+GRID = np.linspace(0.04, 0.96, 12)
+"""Candidate weights of a split intersection; the trace is within a few percent of that of a finer grid."""
 GRID.flags.writeable = False
 
 RING_RAD = 0.2
