@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from agent.estimation.gaussian import inverse, symmetrize, wrap_components
 from agent.estimation.observation import RelativeModel
-from agent.estimation.track_start import MAX_HEADING_RAD, seen_place
+from agent.estimation.track_start import seen_place
 from agent.estimation.weighing import Mask, Rule, weighed
 from agent.settings import RoundWeights
 
@@ -34,10 +34,12 @@ Array = NDArray[np.float64]
 PLACING = ("range_bearing", "vector")
 """Kinds of measurement that tell a place without knowing an altitude well."""
 
-ODDS = np.geomspace(0.1, 100.0, 12)
-GRID = ODDS / (1.0 + ODDS)
-"""Candidate weights of a split intersection; other robots often know less than the own belief, hence more near 1."""
+GRID = np.linspace(0.04, 0.96, 12)
+"""Candidate weights of a split intersection; the trace is within a few percent of that of a finer grid."""
 GRID.flags.writeable = False
+
+RING_RAD = 0.2
+"""Deviation of a heading from which on the places where something may be seen are a ring, not a line across."""
 
 FLATTEST = 1e-9
 """A measurement whose Jacobian in x, y has a smaller determinant, relative to its rows, tells no place."""
@@ -88,13 +90,10 @@ def target_correction(
 
     believed (k,) is what the robot believes of the target. A target in space is taken to be at the altitude believed,
     whose variance is part of `pose`. `exact`: the measurement is converted to a place, and linearized there; without,
-    it is linearized at the place believed, as printed. None if it does not determine the place, or too vaguely: of an
-    unsure heading the place is a ring.
+    it is linearized at the place believed, as printed. None if it does not determine the place.
     """
     observer, subject = model.observer, model.subject
     if model.kind not in PLACING or observer.heading is None or model.landmark is not None:
-        return None
-    if own_cov[observer.heading, observer.heading] > MAX_HEADING_RAD**2:
         return None
     joint = np.concatenate([own_mean, believed])
     n, altitude = len(own_mean), subject.altitude
@@ -115,7 +114,13 @@ def target_correction(
     if altitude is not None:
         by_altitude = H[:, n + altitude]
         pose += altitude_variance * np.outer(by_altitude, by_altitude)
-    return Placed(place.copy(), symmetrize(G @ R @ G.T), symmetrize(G @ pose @ G.T))
+    pose = G @ pose @ G.T
+    turned = own_cov[observer.heading, observer.heading]
+    if turned > RING_RAD**2:
+        # The mean square of an arc's second order, d delta^2 / 2, for a normal delta.
+        away = place - own_mean[:2]
+        pose += 0.75 * turned**2 * np.outer(away, away)
+    return Placed(place.copy(), symmetrize(G @ R @ G.T), symmetrize(pose))
 
 
 def robot_update(

@@ -6,7 +6,7 @@ nor is the prior P_0, which may know some direction exactly. Rules of the weight
 
 trace       the least trace, by w_l <- w_l sqrt(tr(P S_l P)), normalised; each iteration lowers it
 logdet      the least determinant, by w_l <- w_l tr(S_l P)
-info        w_l ~ 1 / tr(S_l): eq. 2.5, whose covariances do not exist, with informations in their place
+info        w_l ~ tr(S_l): eq. 2.5 with 1 / tr(S_l) for the trace of a covariance that does not exist
 pinv_guard  w_l ~ 1 / tr(S_l^+): eq. 2.5 with pseudo-inverses
 
 All but `info` keep the prior where the fused covariance costs more. Su 2022 weighs in two stages, corrections first and
@@ -31,9 +31,6 @@ ITERATIONS = 25
 
 RANK = 1e-9
 """Eigenvalues of a product below this share of its largest one are rounding, not information."""
-
-ROUNDING = 1e-15
-"""The same of a covariance that was stored as such; its components have units of their own."""
 
 LEAST = 1e-300
 """A size that is divided by instead of zero."""
@@ -105,30 +102,31 @@ def _least(root: Array, whitened: Array, used: Mask, rule: Rule) -> Array:
 
 
 def _by_size(prior: Array, informations: Array, used: Mask, rule: Rule, staged: bool) -> Array:
-    """Weights (..., 1 + m) that fall with the size of what is weighed (Su 2022, eq. 2.5)."""
+    """Weights (..., 1 + m) by the traces of what is weighed (Su 2022, eq. 2.5)."""
+    size, sureness = _trace(prior), (_trace if rule == "info" else _pseudo_sureness)
+    of_prior = 1.0 / np.maximum(size, LEAST)
     if rule == "info":
-        of_prior, of_each = _trace(_pseudo_inverse(prior, ROUNDING)), _trace(informations)
-    else:
-        of_prior, of_each = _trace(prior), _trace(_pseudo_inverse(informations))
+        # A prior without any error has no inverse, and is as sure as can be.
+        inverse = np.asarray(np.linalg.pinv(prior, hermitian=True))
+        of_prior = np.where(size > 0.0, _trace(inverse), of_prior)
     own = np.broadcast_to(of_prior, used.shape[:-1])[..., None]
-    always = np.ones_like(own, dtype=bool)
+    each = sureness(informations)
     if not staged:
-        return _shares(np.concatenate([own, of_each], axis=-1), np.concatenate([always, used], axis=-1))
-    eta = _shares(of_each, used)
+        return _shares(np.concatenate([own, each], axis=-1))
+    eta = _shares(each)
     together = np.sum(eta[..., None, None] * informations, axis=-3)
-    of_all = _trace(together if rule == "info" else _pseudo_inverse(together))[..., None]
-    some = used.any(axis=-1, keepdims=True)
-    zeta = _shares(np.concatenate([own, of_all], axis=-1), np.concatenate([always, some], axis=-1))
+    zeta = _shares(np.concatenate([own, sureness(together)[..., None]], axis=-1))
     return np.concatenate([zeta[..., :1], zeta[..., 1:] * eta], axis=-1)
 
 
-def _pseudo_inverse(matrices: Array, rank: float = RANK) -> Array:
-    return np.asarray(np.linalg.pinv(matrices, rcond=rank, hermitian=True))
+def _pseudo_sureness(informations: Array) -> Array:
+    """1 / tr(S^+) (...) of informations S (..., n, n); 0 of those that tell nothing."""
+    traces = _trace(np.asarray(np.linalg.pinv(informations, rcond=RANK, hermitian=True)))
+    return np.asarray(np.where(traces > 0.0, 1.0 / np.maximum(traces, LEAST), 0.0))
 
 
-def _shares(sizes: Array, there: Mask) -> Array:
-    """Weights (..., m) in inverse proportion to sizes (..., m) of what is `there`; none if nothing is."""
-    inverse = np.where(there, 1.0 / np.maximum(sizes, LEAST), 0.0)
-    largest = np.maximum(inverse.max(axis=-1, keepdims=True, initial=0.0), LEAST)
-    inverse = inverse / largest
-    return np.asarray(inverse / np.maximum(inverse.sum(axis=-1, keepdims=True), LEAST))
+def _shares(sureness: Array) -> Array:
+    """Weights (..., m) in proportion to what is at least zero; zeros if all are."""
+    largest = sureness.max(axis=-1, keepdims=True, initial=0.0)
+    scaled = sureness / np.maximum(largest, LEAST)
+    return np.asarray(scaled / np.maximum(scaled.sum(axis=-1, keepdims=True), LEAST))

@@ -74,7 +74,7 @@ def test_the_guard_is_what_keeps_the_prior() -> None:
 def by_hand(prior: Array, informations: Array, rule: Rule, staged: bool) -> tuple[Array, Array]:
     """Eq. 2.5 and 2.4, or 2.10a and 2.11a, of informations that have inverses."""
     def size(information: Array) -> float:
-        return float(np.trace(information if rule == "info" else np.linalg.inv(information)))
+        return float(1.0 / np.trace(information) if rule == "info" else np.trace(np.linalg.inv(information)))
 
     own = np.linalg.inv(prior)
     if staged:
