@@ -132,7 +132,7 @@ def test_the_search_of_the_default_budget_is_five_by_nine_and_two_rounds() -> No
 def test_of_equal_commands_the_slowest_and_straightest_is_taken() -> None:
     search = Search.within(61, 0.5, 0.6)
     assert np.array_equal(search.best(lambda commands: np.zeros(len(commands))), [0.0, 0.0])
-    assert np.array_equal(search.best(lambda commands: np.full(len(commands), np.nan)), [0.0, 0.0])
+    assert np.array_equal(search.best(lambda commands: np.where(commands[:, 0] < 0.4, np.nan, 1.0)), [0.5, 0.0])
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -167,6 +167,9 @@ def test_who_faces_away_from_the_target_turns_on_the_spot() -> None:
     found = chosen(optimal("improved"), seen)
     assert found.speed_mps == 0.0
     assert found.yaw_rate_radps == pytest.approx(-np.pi / 5)
+    near, far = view([0.0, 8.0, 0.0], name="t1"), view([0.0, -10.0, 0.0], name="t2")
+    between = chosen(optimal("improved"), Situation(0, 1.0, member("r1", [0.0, 0.0, 0.0], near, far)))
+    assert between.yaw_rate_radps > 0.3
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -226,7 +229,7 @@ def test_rubbish_from_a_peer_moves_nobody_out_of_the_limits(kind: Literal["poten
 
 
 def test_nobody_follows_a_peer_that_tells_of_a_place_far_out_of_reach() -> None:
-    own, far = member("r1", [0.0, 0.0, 0.0], view([8.0, 0.0, 0.0])), member("r2", [-500.0, 0.0, 0.0])
+    own, far = member("r1", [0.0, 0.0, 0.0], view([8.0, 0.0, 0.0])), member("r2", [400.0, 300.0, 0.0])
     assert chosen(optimal(), Situation(0, 1.0, own, (far,))) == chosen(optimal(), Situation(0, 1.0, own))
 
 
