@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -169,6 +170,12 @@ class Prediction:
             [self.others.covs[:, :2, :2], *(target.place_cov[None] for target in self.targets)]
         )
 
+    @cached_property
+    def nearest(self) -> int | None:
+        """Which of `targets` will be nearest to where the robot is now; None without any."""
+        places = [target.place - self._situation.own.pose[:2] for target in self.targets]
+        return int(np.argmin(np.linalg.norm(places, axis=1))) if places else None
+
     def _forecast(self, views: tuple[Believer, ...]) -> TargetForecast:
         settings, dt = self._settings, self._situation.dt_s
         first = views[0] if views[0].member == 0 else max(views, key=lambda believer: believer.certainty)
@@ -177,9 +184,11 @@ class Prediction:
         start = ahead[views.index(first)]
         mean, growth, noise = start.mean, np.eye(len(start.mean)), np.zeros_like(start.cov)
         track = [mean[:2]]
-        for _ in range(settings.horizon):
+        for number in range(max(settings.ahead, settings.horizon)):
             step = first.view.motion.drift(mean, noise, dt, "jacobian")
-            mean, noise, growth = step.mean, step.cov, step.F @ growth
+            mean = step.mean
+            if number < settings.horizon:
+                noise, growth = step.cov, step.F @ growth
             track.append(mean[:2])
         others = [index for index, item in enumerate(views) if item.member > 0]
         seers = [views[index].member - 1 for index in others]
@@ -216,8 +225,9 @@ class Prediction:
         own_trace = grown_trace(covs, track, new.way, new.heading)
         pose_part = sight.pose_part(new.covs)
         targets, off_nose = np.zeros(len(commands)), np.zeros(len(commands))
-        nearest = np.inf
-        for index, target in enumerate(self.targets, start=len(self.others.poses)):
+        robots = len(self.others.poses)
+        for number, target in enumerate(self.targets):
+            index = robots + number
             cov, own_seen = np.repeat(target.unseen[None], len(commands), axis=0), sight.seen[:, index]
             if own_seen.any():
                 cov[own_seen] = predicted_target_cov(
@@ -228,9 +238,8 @@ class Prediction:
                     settings.weights,
                 )
             targets += np.einsum("ij,cij->c", target.growth, cov) + target.noise
-            distance = float(np.linalg.norm(target.place - own.pose[:2]))
-            if distance < nearest:
-                nearest, off_nose = distance, np.abs(sight.bearings[:, index])
+            if number == self.nearest:
+                off_nose = np.abs(sight.bearings[:, index])
         return Predicted(own_trace, targets, new.track[:, : settings.ahead + 1], off_nose)
 
 

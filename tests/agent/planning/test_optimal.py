@@ -183,6 +183,25 @@ def test_without_a_target_robots_keep_apart_and_hardly_move(form: Form) -> None:
         assert field.nearest(begin=30) > 4.5
 
 
+@pytest.mark.parametrize("names", [("t1", "t2"), ("t2", "t1")])
+def test_of_two_targets_far_apart_the_nearest_is_kept_in_sight(names: tuple[str, str]) -> None:
+    """As published the costs of both add up, and the robot goes to the middle, from where it sees neither."""
+    views = view([-10.0, 0.0, np.pi], name=names[0]), view([30.0, 0.0, 0.0], name=names[1])
+    away = Situation(0, 1.0, member("r1", [0.0, 0.0, 0.0], *views))
+    assert chosen(optimal("published"), away).speed_mps == 0.5
+    assert chosen(optimal("improved"), away).speed_mps == 0.0
+    toward = Situation(0, 1.0, member("r1", [4.0, 0.0, np.pi], *views))
+    assert chosen(optimal("published"), toward).speed_mps == 0.0
+    assert chosen(optimal("improved"), toward) == Command(0.5, 0.0)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_robot_goes_after_a_neighbour_that_gets_out_of_reach(form: Form) -> None:
+    for distance, speed in ((26.0, 0.0), (33.0, 0.5)):
+        seen = Situation(0, 1.0, member("r1", [0.0, 0.0, 0.0]), (member("r2", [distance, 0.0, 0.0]),))
+        assert chosen(optimal(form), seen) == Command(speed, 0.0)
+
+
 def test_what_neighbours_believe_is_enough() -> None:
     other = member("r2", [0.0, 15.0, 0.0], view([30.0, 0.0, 0.0]))
     found = chosen(optimal(), Situation(0, 1.0, member("r1", [0.0, 0.0, 0.0]), (other,)))
