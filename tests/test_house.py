@@ -37,6 +37,7 @@ PURE = (
     "agent/plan_timer.py",
     "agent/frames.py",
     *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "agent" / "estimation").glob("*.py"))),
+    *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "agent" / "planning").glob("*.py"))),
     "sim/world.py",
     "sim/motion.py",
     "sim/vehicle.py",

@@ -9,6 +9,7 @@ target, though a sensor that ends at 15 m has lost it by then. `improved`, J is 
 3 m off and up to 1 m more for two deviations of where they are, a target may be 1 m less far than the sensor reaches,
 beliefs of targets that are told late are moved on to the present (robots are taken to be where they were when they
 told: going on with old commands leads to collisions), and where nothing else differs a robot faces the nearest target.
+Of several targets only the nearest can be too far then: who keeps between all sees none, once they are far apart.
 Without a target the sum is left without its terms: robots keep apart and in reach, and stand still apart from that.
 
 The cost jumps where something gets into view, so nothing is known of gradients: the best of a grid of speeds and yaw
@@ -141,12 +142,14 @@ class Objective:
         self._prediction = prediction = Prediction(settings, situation, targets)
         robots, sought = len(prediction.others.poses), len(prediction.targets)
         self._tracks = np.concatenate([prediction.others.track, *(target.track[None] for target in prediction.targets)])
-        target_most = settings.sensing.max_range_m - SENSOR_MARGIN_M if self._improved else PUBLISHED_TARGET_MOST_M
-        self._most = np.array([settings.radio_range_m] * robots + [target_most] * sought)[:, None]
+        self._most = np.array([settings.radio_range_m] * robots + [PUBLISHED_TARGET_MOST_M] * sought)[:, None]
         # Who tells of a place far out of reach is not there; he is not to be followed.
         self._farthest = np.array([2.0 * settings.radio_range_m] * robots + [np.inf] * sought)[:, None]
         self._least = np.full((robots + sought, 1), PUBLISHED_LEAST_M)
         if self._improved:
+            self._most[robots:] = np.inf
+            if prediction.nearest is not None:
+                self._most[robots + prediction.nearest] = settings.sensing.max_range_m - SENSOR_MARGIN_M
             covs = [*prediction.others.covs[:, :2, :2], *(target.place_cov for target in prediction.targets)]
             for index, cov in enumerate(covs):
                 widest = float(np.linalg.eigvalsh(cov + situation.own.cov[:2, :2])[-1])

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -116,7 +117,8 @@ class TargetForecast:
     place (2,), place_cov (2, 2)  at k, by the robot's belief
     track (t1 + 1, 2)  where it is at k ... k + t1
     prior (n, n)  covariance at k of what all believe of it together
-    sensor, pose (j - 1 or j, 2, 2), seen (j - 1 or j,)  what the others will see of it
+    sensor, pose (m, 2, 2), seen (m,)  what the m others that believe something of it will see of it
+    unseen (n, n)  covariance at k if the robot does not see it
     growth (n, n), noise  tr P(k + t2) = <growth, P(k)> + noise
     """
 
@@ -127,6 +129,7 @@ class TargetForecast:
     sensor: Array
     pose: Array
     seen: NDArray[np.bool_]
+    unseen: Array
     growth: Array
     noise: float
 
@@ -167,6 +170,12 @@ class Prediction:
             [self.others.covs[:, :2, :2], *(target.place_cov[None] for target in self.targets)]
         )
 
+    @cached_property
+    def nearest(self) -> int | None:
+        """Which of `targets` will be nearest to where the robot is now; None without any."""
+        places = [target.place - self._situation.own.pose[:2] for target in self.targets]
+        return int(np.argmin(np.linalg.norm(places, axis=1))) if places else None
+
     def _forecast(self, views: tuple[Believer, ...]) -> TargetForecast:
         settings, dt = self._settings, self._situation.dt_s
         first = views[0] if views[0].member == 0 else max(views, key=lambda believer: believer.certainty)
@@ -175,22 +184,29 @@ class Prediction:
         start = ahead[views.index(first)]
         mean, growth, noise = start.mean, np.eye(len(start.mean)), np.zeros_like(start.cov)
         track = [mean[:2]]
-        for _ in range(settings.horizon):
+        for number in range(max(settings.ahead, settings.horizon)):
             step = first.view.motion.drift(mean, noise, dt, "jacobian")
-            mean, noise, growth = step.mean, step.cov, step.F @ growth
+            mean = step.mean
+            if number < settings.horizon:
+                noise, growth = step.cov, step.F @ growth
             track.append(mean[:2])
         others = [index for index, item in enumerate(views) if item.member > 0]
         seers = [views[index].member - 1 for index in others]
         places = np.array([ahead[index].mean[:2] for index in others]).reshape(-1, 1, 2)
-        seen = sightings(self.others.poses[seers], places, settings.sensing)
+        sight = sightings(self.others.poses[seers], places, settings.sensing)
+        sensor, pose = sight.sensor[:, 0], sight.pose_part(self.others.covs[seers])[:, 0]
+        seen, none = sight.seen[:, 0], np.zeros((0, 2, 2))
+        covs = np.array([item.cov for item in ahead])
+        prior = predicted_target_cov(covs, none, none, np.zeros(0, dtype=bool), settings.weights)
         return TargetForecast(
             start.mean[:2],
             start.cov[:2, :2],
             np.array(track[: settings.ahead + 1]),
-            _together([item.cov for item in ahead], settings),
-            seen.sensor[:, 0],
-            seen.pose_part(self.others.covs[seers])[:, 0],
-            seen.seen[:, 0],
+            prior,
+            sensor,
+            pose,
+            seen,
+            predicted_target_cov(prior[None], sensor, pose, seen, settings.weights),
             growth.T @ growth,
             float(noise.trace()),
         )
@@ -201,35 +217,32 @@ class Prediction:
         steps = max(settings.ahead, settings.horizon) + 1
         new = moved(own.pose[None], own.cov[None], commands, self._situation.dt_s, steps, settings)
         sight = sightings(new.poses, self._places[None], settings.sensing)
-        covs = predicted_robot_cov(
-            new.covs, sight.jacobian, sight.sensor, self._place_covs, sight.seen, settings.weights
-        )
+        covs, some = new.covs.copy(), sight.seen.any(axis=1)
+        if some.any():
+            H, sensor, seen = sight.jacobian[some], sight.sensor[some], sight.seen[some]
+            covs[some] = predicted_robot_cov(covs[some], H, sensor, self._place_covs, seen, settings.weights)
         track = new.track[:, : settings.horizon + 1]
         own_trace = grown_trace(covs, track, new.way, new.heading)
         pose_part = sight.pose_part(new.covs)
         targets, off_nose = np.zeros(len(commands)), np.zeros(len(commands))
-        nearest = np.inf
-        for index, target in enumerate(self.targets, start=len(self.others.poses)):
-            cov = predicted_target_cov(
-                target.prior[None],
-                _with_own(sight.sensor[:, index], target.sensor),
-                _with_own(pose_part[:, index], target.pose),
-                _with_own(sight.seen[:, index], target.seen),
-                settings.weights,
-            )
+        robots = len(self.others.poses)
+        for number, target in enumerate(self.targets):
+            index = robots + number
+            cov, own_seen = np.repeat(target.unseen[None], len(commands), axis=0), sight.seen[:, index]
+            if own_seen.any():
+                cov[own_seen] = predicted_target_cov(
+                    target.prior[None],
+                    _after(sight.sensor[own_seen, index], target.sensor),
+                    _after(pose_part[own_seen, index], target.pose),
+                    _after(own_seen[own_seen], target.seen),
+                    settings.weights,
+                )
             targets += np.einsum("ij,cij->c", target.growth, cov) + target.noise
-            distance = float(np.linalg.norm(target.place - own.pose[:2]))
-            if distance < nearest:
-                nearest, off_nose = distance, np.abs(sight.bearings[:, index])
+            if number == self.nearest:
+                off_nose = np.abs(sight.bearings[:, index])
         return Predicted(own_trace, targets, new.track[:, : settings.ahead + 1], off_nose)
 
 
-def _together(covs: list[Array], settings: PlanningSettings) -> Array:
-    """Covariance (n, n) of beliefs with `covs` (n, n) together, the robot's own first, without any sightings."""
-    none = np.zeros((0, 2, 2))
-    return predicted_target_cov(np.array(covs), none, none, np.zeros(0, dtype=bool), settings.weights)
-
-
-def _with_own(own: NDArray[Scalar], others: NDArray[Scalar]) -> NDArray[Scalar]:
-    """(c, 1 + m, ...) of the own (c, ...) and those of m others (m, ...), which are the same for all candidates."""
+def _after(own: NDArray[Scalar], others: NDArray[Scalar]) -> NDArray[Scalar]:
+    """(c, 1 + m, ...) of the own (c, ...) and then those of m others (m, ...), the same for all candidates."""
     return np.concatenate([own[:, None], np.broadcast_to(others, (len(own), *others.shape))], axis=1)

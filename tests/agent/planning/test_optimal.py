@@ -132,7 +132,7 @@ def test_the_search_of_the_default_budget_is_five_by_nine_and_two_rounds() -> No
 def test_of_equal_commands_the_slowest_and_straightest_is_taken() -> None:
     search = Search.within(61, 0.5, 0.6)
     assert np.array_equal(search.best(lambda commands: np.zeros(len(commands))), [0.0, 0.0])
-    assert np.array_equal(search.best(lambda commands: np.full(len(commands), np.nan)), [0.0, 0.0])
+    assert np.array_equal(search.best(lambda commands: np.where(commands[:, 0] < 0.4, np.nan, 1.0)), [0.5, 0.0])
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -167,6 +167,9 @@ def test_who_faces_away_from_the_target_turns_on_the_spot() -> None:
     found = chosen(optimal("improved"), seen)
     assert found.speed_mps == 0.0
     assert found.yaw_rate_radps == pytest.approx(-np.pi / 5)
+    near, far = view([0.0, 8.0, 0.0], name="t1"), view([0.0, -10.0, 0.0], name="t2")
+    between = chosen(optimal("improved"), Situation(0, 1.0, member("r1", [0.0, 0.0, 0.0], near, far)))
+    assert between.yaw_rate_radps > 0.3
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -178,6 +181,25 @@ def test_without_a_target_robots_keep_apart_and_hardly_move(form: Form) -> None:
     assert np.mean(field.speeds[-10:]) < 0.08
     if form == "improved":
         assert field.nearest(begin=30) > 4.5
+
+
+@pytest.mark.parametrize("names", [("t1", "t2"), ("t2", "t1")])
+def test_of_two_targets_far_apart_the_nearest_is_kept_in_sight(names: tuple[str, str]) -> None:
+    """As published the costs of both add up, and the robot goes to the middle, from where it sees neither."""
+    views = view([-10.0, 0.0, np.pi], name=names[0]), view([30.0, 0.0, 0.0], name=names[1])
+    away = Situation(0, 1.0, member("r1", [0.0, 0.0, 0.0], *views))
+    assert chosen(optimal("published"), away).speed_mps == 0.5
+    assert chosen(optimal("improved"), away).speed_mps == 0.0
+    toward = Situation(0, 1.0, member("r1", [4.0, 0.0, np.pi], *views))
+    assert chosen(optimal("published"), toward).speed_mps == 0.0
+    assert chosen(optimal("improved"), toward) == Command(0.5, 0.0)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_robot_goes_after_a_neighbour_that_gets_out_of_reach(form: Form) -> None:
+    for distance, speed in ((26.0, 0.0), (33.0, 0.5)):
+        seen = Situation(0, 1.0, member("r1", [0.0, 0.0, 0.0]), (member("r2", [distance, 0.0, 0.0]),))
+        assert chosen(optimal(form), seen) == Command(speed, 0.0)
 
 
 def test_what_neighbours_believe_is_enough() -> None:
@@ -226,7 +248,7 @@ def test_rubbish_from_a_peer_moves_nobody_out_of_the_limits(kind: Literal["poten
 
 
 def test_nobody_follows_a_peer_that_tells_of_a_place_far_out_of_reach() -> None:
-    own, far = member("r1", [0.0, 0.0, 0.0], view([8.0, 0.0, 0.0])), member("r2", [-500.0, 0.0, 0.0])
+    own, far = member("r1", [0.0, 0.0, 0.0], view([8.0, 0.0, 0.0])), member("r2", [400.0, 300.0, 0.0])
     assert chosen(optimal(), Situation(0, 1.0, own, (far,))) == chosen(optimal(), Situation(0, 1.0, own))
 
 

@@ -10,6 +10,7 @@ import pytest
 from agent.estimation.gaussian import wrap_scalar
 from agent.estimation.jlatt import predicted_robot_cov, predicted_target_cov
 from agent.estimation.motion import CONSTANT_VELOCITY, SPATIAL, HeldAltitude, TargetMotion
+from agent.planning.optimal import Objective
 from agent.planning.prediction import Prediction, grown_trace, moved, sightings
 from agent.planning.situation import Member, Situation, TargetView
 from agent.planning.team_view import believers
@@ -153,6 +154,16 @@ def one_by_one(
         step = TARGET.drift(mean, target_after, 1.0, "jacobian")
         mean, target_after = step.mean, step.cov
     return float(np.trace(after)), float(np.trace(target_after))
+
+
+def test_places_may_count_further_ahead_than_uncertainty() -> None:
+    settings, situation = replace(SETTINGS, ahead=9, horizon=3), team(np.random.default_rng(0), 3)
+    found = Prediction(settings, situation, believers(situation, present=True)).of(COMMANDS)
+    assert found.track.shape == (4, 10, 2)
+    for index, command in enumerate(COMMANDS):
+        alone = one_by_one(settings, situation, "t1", command)
+        assert (found.own[index], found.targets[index]) == pytest.approx(alone, rel=1e-9)
+    assert np.all(np.isfinite(Objective(settings, situation)(COMMANDS)))
 
 
 @pytest.mark.parametrize("weights", WEIGHTS)
