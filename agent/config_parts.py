@@ -42,7 +42,7 @@ PROTECTED = UnsafeSettings()
 class LocalizationPart(Part):
     kind: Literal["clat", "replica", "jlatt"] = "clat"
     form: Literal["auto", "split_joint", "safe", "published", "joint"] = "auto"
-    transform: Literal["unscented", "linearized", "jacobian"] = "unscented"
+    transform: Literal["unscented", "linearized", "jacobian"] | None = None
     correlation: Literal["factors", "ignored"] = "factors"
     weights: RoundWeights = "split_ci"
     pair_interval_s: NotNegative | None = None
@@ -53,7 +53,8 @@ class LocalizationPart(Part):
         """`safe` uses a contact of a pair every 3 s and trace weights; `published` every one and log det.
 
         `split_joint` and `joint` use every contact, and cap innovations unless told otherwise; `replica` and `jlatt`
-        have no forms, and cap them only if told. Raises `ConfigError` for what the kind does not have, and for a naive
+        have no forms, and cap them only if told. `jlatt` is linearized as Su 2022 is: a transform that allows for wrong
+        headings makes beliefs vague that no correlation is known of. Raises `ConfigError` for what the kind does not have, and for a naive
         baseline of `split_joint` and `joint`.
         """
         if self.kind != "jlatt":
@@ -63,7 +64,7 @@ class LocalizationPart(Part):
                 self._refuse(key, "clat", f"kind '{self.kind}' has no contacts of pairs")
             return LocalizationSettings(
                 kind=self.kind,
-                transform=self.transform,
+                transform=self.transform or ("jacobian" if self.kind == "jlatt" else "unscented"),
                 weights=self.weights,
                 innovation_cap=self.innovation_cap or 0.0,
             )
@@ -77,7 +78,7 @@ class LocalizationPart(Part):
         cap = self.innovation_cap if self.innovation_cap is not None else (9.0 if joint else 0.0)
         return LocalizationSettings(
             form=self.form,
-            transform=self.transform,
+            transform=self.transform or "unscented",
             correlation=self.correlation,
             sighting_weight="trace" if safe else "logdet",
             fusion_weight="fast" if safe else "logdet",
@@ -88,8 +89,8 @@ class LocalizationPart(Part):
 
     def rigid(self) -> str | None:
         """What makes robots begin together, with tracks that last; None: nothing."""
-        if self.kind != "clat":
-            return f"kind = '{self.kind}'"
+        if self.kind == "replica":
+            return "kind = 'replica'"
         return "form = 'joint'" if self.form == "joint" else None
 
     def _refuse(self, key: str, owner: str, why: str) -> None:
