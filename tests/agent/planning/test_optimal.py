@@ -280,7 +280,7 @@ def test_without_potentials_robots_stop_and_let_the_target_go() -> None:
     """Su 2022, figure 4.4: to stand still and look at each other is the cheapest in the short run, so few follow."""
     poses = np.array([[-6.0, -3.0, 0.3], [2.0, 5.0, -0.5], [2.0, 13.0, 1.0], [-6.0, 13.0, -1.0]])
     with_it, without = (
-        Field(optimal(potential_weight=weight), poses, np.array([10.0, 5.0, 0.0])).run(55) for weight in (1.0, 0.0)
+        Field(optimal(potential_weight=weight), poses, np.array([10.0, 5.0, 0.0])).run(50) for weight in (1.0, 0.0)
     )
 
     def left_behind(field: Field) -> np.ndarray:
