@@ -37,7 +37,7 @@ class Pilot:
     def __init__(self, settings: AgentSettings, counters: Counter[str]) -> None:
         self._settings, self._counters = settings, counters
         self._planner = build_planner(settings.planning, settings.robot)
-        self._fallback = build_planner(replace(settings.planning, kind="potential"), settings.robot)
+        self._fallback = build_planner(replace(settings.planning, kind="potential", form="improved"), settings.robot)
         self._motions = {target.id: target.motion for target in settings.targets}
         self._clocks = PairClocks(settings)
         self._clock = RoundClock(settings.round, settings.start_ns)
