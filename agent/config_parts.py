@@ -54,8 +54,8 @@ class LocalizationPart(Part):
 
         `split_joint` and `joint` use every contact, and cap innovations unless told otherwise; `replica` and `jlatt`
         have no forms, and cap them only if told. `jlatt` is linearized, as in Su 2022: a transform
-        that allows for wrong headings makes beliefs vague that no correlation is known of. Raises `ConfigError` for what the kind does not have, and for a naive
-        baseline of `split_joint` and `joint`.
+        that allows for wrong headings makes beliefs vague that no correlation is known of. Raises `ConfigError` for
+        what the kind does not have, and for a naive baseline of `split_joint` and `joint`.
         """
         if self.kind != "jlatt":
             self._refuse("weights", "jlatt", f"kind '{self.kind}' has no rounds")
