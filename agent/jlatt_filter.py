@@ -88,7 +88,7 @@ class JlattFilter:
         self._detected: dict[str, Detected] = {}
         self._velocity, self._yaw_rate = np.zeros(3), 0.0
         self._open: _Open | None = None
-        self._closed_ns = first.t_ns
+        self._closed_ns = first.t_ns - settings.round.period_ns
         self._revision = object()
         self._told_of: tuple[object, Estimate] = None, Estimate(0, "", settings.mean, settings.cov)
 
@@ -208,20 +208,19 @@ class JlattFilter:
     # -- rounds ---------------------------------------------------------------------------------------------
 
     def settled(self, until_ns: int, effects: list[Effect]) -> None:
-        if self._open is not None or until_ns < self._clock.next_ns:
+        if self._open is not None:
             return
-        lateness = self._settings.lateness
-        if self.t_ns < self._clock.next_ns - lateness.tolerance_ns:
-            if until_ns >= self._clock.next_ns + lateness.odometry_wait_ns:
-                # Without odometry there is nothing to tell of this instant.
-                self._counters["round.skipped"] += 1
-                self._clock.open(until_ns)
-            return
-        self._begin(self._clock.open(min(until_ns, self.t_ns + lateness.tolerance_ns)), effects)
+        due_ns = self._clock.due(until_ns)
+        # What odometry has not reached yet, nothing can be told of; what is past, nobody waits for any more.
+        if due_ns is not None and self.t_ns >= due_ns - self._settings.lateness.tolerance_ns:
+            self._counters["round.skipped"] += self._clock.open(due_ns)
+            self._begin(due_ns, effects)
 
     def _begin(self, t_ns: int, effects: list[Effect]) -> None:
         then = self._own.at(t_ns)
-        if then is None:
+        if then is None or then.t_ns < t_ns - self._settings.round.period_ns // 2:
+            # Odometry has leapt over it.
+            self._counters["round.skipped"] += 1
             return
         self._open = _Open(t_ns)
         for target, seen in sorted(self._seen.items()):
@@ -261,12 +260,12 @@ class JlattFilter:
         self._revision = object()
 
     def deadline_ns(self) -> int:
-        lateness = self._settings.lateness
+        """An instant that odometry has not reached is no deadline: the odometry will come, or another round."""
         if self._open is not None:
             return self._open.t_ns + self._settings.round.wait_ns
-        due = self._clock.next_ns + lateness.settle_ns
-        behind = self.t_ns < self._clock.next_ns - lateness.tolerance_ns
-        return due + lateness.odometry_wait_ns if behind else due
+        lateness, next_ns = self._settings.lateness, self._clock.next_ns
+        reached = self.t_ns >= next_ns - lateness.tolerance_ns
+        return next_ns + lateness.settle_ns if reached else FAR_FUTURE_NS
 
     # -- peers ----------------------------------------------------------------------------------------------
 

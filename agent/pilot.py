@@ -79,9 +79,11 @@ class Pilot:
     def act(self, now_ns: int, source: CooperativeFilter, effects: list[Effect]) -> None:
         """Tell and plan, if it is time for that."""
         tolerance = self._settings.lateness.tolerance_ns
-        if source.complete_ns >= self._clock.next_ns - tolerance:
+        due_ns = self._clock.due(source.complete_ns + tolerance)
+        if due_ns is not None:
             estimate = source.estimate()
-            self._open_ns = self._clock.open(source.complete_ns + tolerance)
+            self._counters["plan.skipped"] += self._clock.open(due_ns)
+            self._open_ns = due_ns
             if estimate is not None and not self._lean:
                 effects.append(Broadcast(Channel.BELIEF, estimate.t_ns, self._report(estimate)))
         if self._open_ns is None or not self._ready(now_ns, self._open_ns):

@@ -82,8 +82,13 @@ class RoundClock:
         period, anchor = self._settings.period_ns, self._settings.anchor_ns
         return anchor + ((t_ns - anchor) // period + 1) * period
 
+    def due(self, t_ns: int) -> int | None:
+        """The newest round not later than `t_ns`, if it has not been opened."""
+        newest = self._after(t_ns) - self._settings.period_ns
+        return newest if newest >= self.next_ns else None
+
     def open(self, t_ns: int) -> int:
-        """The newest round not later than `t_ns`, which is the next one or a later one; the one after it is next."""
-        found = self._after(t_ns) - self._settings.period_ns
-        self.next_ns = found + self._settings.period_ns
-        return found
+        """Open the round at `t_ns`, which is due; how many have been left out before it."""
+        skipped = (t_ns - self.next_ns) // self._settings.period_ns
+        self.next_ns = t_ns + self._settings.period_ns
+        return skipped

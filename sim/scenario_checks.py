@@ -6,7 +6,7 @@ from agent.config_file import (
     ConfigError,
 )
 from agent.config_parts import MAX_TEAM
-from agent.estimation.motion import LAYOUTS, UNICYCLE
+from agent.estimation.motion import LAYOUTS
 from agent.estimation.observation import RELATIVE_ANGLES
 from agent.fault_parts import AnyFaultPart, SensorDelayPart, SensorFaultPart, check_faults, named
 from agent.joint_room import check_room
@@ -146,14 +146,6 @@ def _check_team(scenario: Scenario) -> None:
             f"{scenario.name}: localization.kind = 'replica' takes {MAX_TEAM + 1} robots at most, there are "
             f"{len(kinds)}; take 'clat'"
         )
-    if "jlatt" in kinds.values():
-        for mover in scenario.movers().values():
-            if LAYOUTS[mover.model] is not UNICYCLE:
-                place = "robots" if isinstance(mover, RobotPart) else "targets"
-                raise ConfigError(
-                    f"{scenario.name}: {place}.{mover.id}.model = '{mover.model}': localization.kind = 'jlatt' is of "
-                    "x, y and heading; take 'unicycle', or localization.kind = 'clat'"
-                )
 
 
 UNMIXED = {

@@ -22,12 +22,15 @@ def told(peer: str, t_ns: int, stage: RoundStage = RoundStage.PRIOR) -> Told:
 def test_rounds_are_at_whole_periods_since_the_anchor(start: int, anchor: int, first: int) -> None:
     clock = RoundClock(RoundSettings(period_ns=SECOND, anchor_ns=anchor), start)
     assert clock.next_ns == first
-    assert clock.open(first) == first and clock.next_ns == first + SECOND
+    assert clock.due(first - 1) is None
+    assert clock.due(first) == first and clock.open(first) == 0
+    assert clock.due(first) is None and clock.next_ns == first + SECOND
 
 
 def test_who_was_held_up_goes_on_with_the_newest_round() -> None:
     clock = RoundClock(SETTINGS, 0)
-    assert clock.open(7 * SECOND + 3) == 7 * SECOND
+    assert clock.due(7 * SECOND + 3) == 7 * SECOND
+    assert clock.open(7 * SECOND) == 7
     assert clock.next_ns == 8 * SECOND
 
 

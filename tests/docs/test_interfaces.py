@@ -181,7 +181,7 @@ def test_every_key_of_a_part_is_described_and_no_other() -> None:
 
 
 def test_no_key_is_described_that_does_not_exist() -> None:
-    there = set(keys(AgentConfig)) | set(keys(Scenario))
+    there = set(keys(AgentConfig)) | set(keys(Scenario)) | {"extends"}
     told = named("Keys of both files") | named("Keys of an agent's file") | named("Keys of a scenario")
     assert sorted(told - there) == []
 

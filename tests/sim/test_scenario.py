@@ -209,7 +209,7 @@ def test_the_joint_form_has_the_same_tracks_all_the_time() -> None:
 
 def test_an_unknown_scenario_is_answered_with_the_nearest_name() -> None:
     assert "did you mean 'ut-clat'?" in complaint(name="ut_clat")
-    assert "bundled: clock-step, demo, dense-10, dense-10-anchored," in complaint(name="zzz")
+    assert "bundled: ajlatt, ajlatt-ablation, ajlatt-c," in complaint(name="zzz")
 
 
 def test_a_recording_needs_its_path_and_has_no_more_than_it_holds() -> None:
