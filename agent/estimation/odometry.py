@@ -23,15 +23,15 @@ class OdometryNoise:
 
     along_m_per_sqrt_s: float = 0.02
     along_m_per_sqrt_m: float = 0.0
-    along_share: float = 0.0
     across_m_per_sqrt_s: float = 0.0
     vertical_m_per_sqrt_s: float = 0.02
     heading_rad_per_sqrt_s: float = 0.005
     heading_rad_per_sqrt_rad: float = 0.0
-    heading_rad_per_m: float = 0.0
     scale_along: float = 1.0
     scale_turn: float = 1.0
     lag_s: float = 0.0
+    along_share: float = 0.0
+    heading_rad_per_m: float = 0.0
 
     def calibrated(self, delta: Array) -> Array:
         """The increment (dx, dy, dz, dyaw) with the calibrated gains applied."""

@@ -254,8 +254,9 @@ def test_the_normative_example_states_what_the_defaults_are() -> None:
     assert data["lost_above_m"] == defaults["lost_above_m"].default
     assert data["origin"] == defaults["origin"].default
     localization = defaults["localization"].default
-    for key in ("kind", "form", "transform", "correlation", "pair_timeout_s"):
+    for key in ("kind", "form", "correlation", "pair_timeout_s"):
         assert data["localization"][key] == getattr(localization, key)
+    assert data["localization"]["transform"] == localization.settings().transform
     assert math.isclose(data["robots"][0]["start_sigma"]["heading_rad"], math.radians(2.0), rel_tol=1e-6)
 
 
