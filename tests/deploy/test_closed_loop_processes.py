@@ -48,7 +48,7 @@ vehicle = { min_speed_mps = 0.3, max_speed_mps = 0.3 }
 """
 
 
-def test_figures_are_held_against_the_motion_the_world_has_played(tmp_path: Path) -> None:
+def test_truth_is_what_the_world_has_played(tmp_path: Path) -> None:
     """These vehicles have one speed, whatever they are told."""
     path, out = tmp_path / "driving.toml", tmp_path / "out"
     path.write_text(SCENARIO)

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from agent.config_file import ConfigError
 from agent.settings import PlanningSettings, RoundSettings
 from sim.agents import agent_config
+from sim.invariants import InvariantChecker
+from sim.metrics import nees
 from sim.scenario_file import load
-from sim.trial import open_world
+from sim.trial import open_world, run_trial
 
 
 def made(*overrides: str, name: str = "ut-clat") -> Any:
@@ -25,7 +29,6 @@ def planning(*overrides: str, seed: int = 7, robot: int = 0) -> PlanningSettings
 
 
 WIDE = "links.range_m=30.0"
-GAINS = "robots.r2.start_sigma={position_m=1.0, heading_rad=0.1, gain_along=0.1, gain_turn=0.1}"
 STILL = "robots.*.control={}"
 CAMERA = (
     'robots.*.sensors.eye={kind="range_bearing", of=["peers","targets"], sigma_m=0.01, sigma_m_per_m=0.05, '
@@ -101,10 +104,6 @@ def test_rounds_are_those_of_the_scenario() -> None:
             r"robots\.r1\.localization\.kind = 'clat' beside 'jlatt': who takes no part in rounds.*one kind",
         ),
         (["localization.kind=jlatt", "localization.form=safe"], r"form = 'safe' is of kind 'clat'.*leave form out"),
-        (
-            ["localization.kind=jlatt", "robots.r2.model=unicycle_gains", GAINS],
-            r"robots\.r2\.model = 'unicycle_gains'.*take 'unicycle', or localization\.kind = 'clat'",
-        ),
     ],
 )
 def test_what_cannot_be_is_refused_with_key_and_remedy(overrides: list[str], words: str) -> None:
@@ -112,13 +111,45 @@ def test_what_cannot_be_is_refused_with_key_and_remedy(overrides: list[str], wor
         made(*overrides)
 
 
-def test_a_target_without_heading_is_not_of_rounds() -> None:
-    target = (
-        'targets=[{id="t9", model="constant_velocity", start={pose=[0.0,0.0,0.1,0.1]}, '
-        "start_sigma={position_m=1.0, velocity_mps=0.1}}]"
-    )
-    with pytest.raises(ConfigError, match=r"targets\.t9\.model = 'constant_velocity'.*x, y and heading"):
-        made("localization.kind=jlatt", target)
+MIXED = """
+extends = "ajlatt"
+name = "mixed"
+duration_s = 30.0
+window_s = [5.0, 30.0]
+[[robots]]
+id = "r2"
+model = "unicycle_gains"
+start_sigma = { gain_along = 0.05, gain_turn = 0.05 }
+[[robots]]
+id = "r3"
+model = "planar_altitude"
+start = { pose = [-6.0, 13.0, 1.0, 0.0], spread = [0.5, 0.5, 0.2, 1.0] }
+start_sigma = { altitude_m = 0.1 }
+noise = { climb_mps = 0.01 }
+[[targets]]
+id = "t1"
+model = "constant_velocity"
+start = { pose = [10.0, 5.0, 0.25, 0.0] }
+start_sigma = { velocity_mps = 0.2 }
+noise = { acceleration_mps2 = 0.01 }
+"""
+
+
+def test_robots_and_targets_of_any_model_take_part_in_rounds(tmp_path: Path) -> None:
+    file = tmp_path / "mixed.toml"
+    file.write_text(MIXED)
+    result = run_trial(load(str(file)), 1, checker=InvariantChecker(1))
+    for robot, counters in result.counters.items():
+        assert counters["round.closed"] >= 30, robot
+    for robot in ("r2", "r3"):
+        assert result.counters[robot]["round.used_detections"] > 0, robot
+    for robot, trace in result.trace.robots.items():
+        assert float(np.nanmean(nees(trace))) < 1.7, robot
+
+
+def test_a_start_beside_a_peer_is_not_of_rounds() -> None:
+    with pytest.raises(ConfigError, match=r"source = 'peer' does not go with kind = 'jlatt'.*take 'fix' or 'survey'"):
+        made("robots.r2.start_source=peer", name="ajlatt")
 
 
 def test_planning_is_not_of_steered_nor_of_recorded_worlds() -> None:
