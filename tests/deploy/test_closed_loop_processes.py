@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -59,7 +58,6 @@ def test_truth_is_what_the_world_has_played(tmp_path: Path) -> None:
         text=True,
         timeout=120,
         check=False,
-        env={**os.environ, "TMPDIR": str(tmp_path)},
         cwd=tmp_path,
     )
     assert run.returncode == 0, run.stderr
