@@ -106,6 +106,10 @@ class AutoFilter:
         return self._active.t_ns
 
     @property
+    def complete_ns(self) -> int:
+        return self.t_ns
+
+    @property
     def revision(self) -> object:
         return self._active.revision
 

@@ -1,7 +1,8 @@
 """What a vehicle's autopilot says, as core events: MAVLink bytes and fleet times in, events and bytes out; no I/O.
 
 The reader locks on one autopilot, keeps its boot clock in fleet time, asks for the messages it uses and reads nothing
-else. It never commands the vehicle. Whatever arrives is foreign: it is counted under `mavlink.*` and never raises.
+else. It steers the vehicle only if that is switched on, see `agent.steering_link`. Whatever arrives is foreign: it is
+counted under `mavlink.*` and never raises.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from agent import frames
 from agent.autopilot_settings import NS, AutopilotSettings, fix_settings, reads_attitude_heading, reads_place, wanted
-from agent.events import Fix, Odometry
-from agent.requests import MessageRequests
+from agent.effects import Steer
+from agent.events import ControlReport, Fix, Odometry
+from agent.requests import MessageRequests, command_long
+from agent.steering_link import SteeringLink
 from agent.timesync import TimeSync
 from agent.vehicle_fixes import VehicleFixes
 from agent.vehicle_odometry import Increment, OdometryLimits, PoseOdometry, Stamped, VelocityOdometry
@@ -37,7 +40,7 @@ CHILD_FRAMES = (
 )
 
 
-Output = Odometry | Fix
+Output = Odometry | Fix | ControlReport
 
 
 class AutopilotReader:
@@ -59,6 +62,7 @@ class AutopilotReader:
         self._velocities = VelocityOdometry(
             replace(limits, max_gap_ns=max(NS, 3 * settings.message_interval_ns)), self.counters
         )
+        self._steering = SteeringLink(settings.steering, self.counters)
         self._now_ns = 0
         self._received = 0
         self._vehicle: tuple[int, int] | None = None
@@ -71,6 +75,7 @@ class AutopilotReader:
             "HEARTBEAT": self._on_heartbeat,
             "TIMESYNC": self._on_timesync,
             "COMMAND_ACK": self._on_ack,
+            "STATUSTEXT": self._on_text,
             "ODOMETRY": self._on_odometry,
             "ATTITUDE": self._on_attitude,
             "LOCAL_POSITION_NED": self._on_local_position,
@@ -109,6 +114,7 @@ class AutopilotReader:
         """Time goes on; a fleet clock that was set back would leave every deadline in a far future."""
         if now_ns < self._now_ns - CLOCK_STEP_NS:
             self._sync.step()
+            self._steering.restart()
             self._next_heartbeat_ns = 0
         self._now_ns = now_ns
         self._check_epoch()
@@ -191,22 +197,9 @@ class AutopilotReader:
             out.append(self._encode(dialect.MAVLink_timesync_message(0, self._sync.request(now_ns))))
         wanted = self._requests.due(now_ns)
         if wanted is not None:
-            out.append(
-                self._encode(
-                    dialect.MAVLink_command_long_message(
-                        *self._vehicle,
-                        dialect.MAV_CMD_SET_MESSAGE_INTERVAL,
-                        0,
-                        wanted.message_id,
-                        wanted.interval_ns / 1000.0,
-                        0.0,
-                        0.0,
-                        0.0,
-                        0.0,
-                        0.0,
-                    )
-                )
-            )
+            number, interval_us = dialect.MAV_CMD_SET_MESSAGE_INTERVAL, wanted.interval_ns / 1000.0
+            out.append(self._encode(command_long(self._vehicle, number, wanted.message_id, interval_us)))
+        out.extend(self._encode(message) for message in self._steering.due(now_ns, self._vehicle))
         return out
 
     def next_deadline_ns(self) -> int:
@@ -215,7 +208,22 @@ class AutopilotReader:
             return self._now_ns
         if self._vehicle is None:
             return self._next_heartbeat_ns
-        return min(self._next_heartbeat_ns, self._sync.next_request_ns, self._requests.next_deadline_ns())
+        others = (self._requests.next_deadline_ns(), self._steering.next_deadline_ns())
+        return min(self._next_heartbeat_ns, self._sync.next_request_ns, *others)
+
+    def steer(self, steer: Steer) -> None:
+        """How the vehicle is to move from now on."""
+        self._steering.steer(steer)
+
+    def reports(self, now_ns: int) -> list[ControlReport]:
+        """What there is to tell of the vehicle's obedience."""
+        return self._steering.reports(now_ns)
+
+    def parting(self, now_ns: int) -> list[bytes]:
+        """The last frames before the link is closed: a vehicle that is steered is to stand still."""
+        if self._vehicle is None:
+            return []
+        return [self._encode(message) for message in self._steering.parting(now_ns, self._vehicle)]
 
     def _encode(self, message: Any) -> bytes:
         data: bytes = message.pack(self._pack)
@@ -226,6 +234,11 @@ class AutopilotReader:
 
     def _on_heartbeat(self, now_ns: int, message: Any) -> list[Output]:
         self._heartbeat_ns = now_ns
+        self._steering.heartbeat(now_ns, message)
+        return []
+
+    def _on_text(self, now_ns: int, message: Any) -> list[Output]:
+        self._steering.text(now_ns, message)
         return []
 
     def _on_timesync(self, now_ns: int, message: Any) -> list[Output]:
@@ -240,6 +253,8 @@ class AutopilotReader:
         ours = message.target_system in (0, self._pack.srcSystem) and message.target_component in (0, OWN_COMPONENT)
         if ours and message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
             self._requests.answered(now_ns, message.result)
+        elif ours:
+            self._steering.acknowledged(now_ns, message)
         return []
 
     def _on_odometry(self, now_ns: int, message: Any) -> list[Output]:
@@ -355,6 +370,7 @@ class AutopilotReader:
                 "samples": self._sync.samples,
             },
             "messages": self._requests.rates(self._now_ns),
+            "steering": self._steering.status(self._now_ns),
             "reasons": self._reasons(),
         }
 

@@ -1,4 +1,4 @@
-"""What is read from an autopilot, and which messages that takes."""
+"""What is read from an autopilot, which messages that takes, and whether it is steered."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from agent import frames
 from agent.estimation.odometry import OdometryNoise
 from agent.requests import Wanted
+from agent.steering_link import SteeringSettings
 from agent.timesync import MS, TimeSyncSettings
 from agent.vehicle_fixes import FixSettings
 
@@ -28,6 +29,7 @@ class AutopilotSettings:
     fix_inflation    R is multiplied by it: positions of an autopilot are filtered, hence correlated in time
     odometry_source  "odometry": ODOMETRY; "velocity": LOCAL_POSITION_NED velocity with ATTITUDE yaw; "none"
     system_id        the vehicle; None: the first autopilot heard
+    steering         None: the vehicle is never told to move
     max_distance_m   fixes farther from the origin are refused: a wrong origin, or a GPS gone astray
     """
 
@@ -46,6 +48,7 @@ class AutopilotSettings:
     max_speed_mps: float = 30.0
     max_distance_m: float = 100_000.0
     timesync: TimeSyncSettings = field(default_factory=TimeSyncSettings)
+    steering: SteeringSettings | None = None
 
     def __post_init__(self) -> None:
         for key, value, valid in (

@@ -36,7 +36,6 @@ from agent.config_parts import (
     MotionPart,
     MountVector,
     NetworkPart,
-    OdometryPart,
     SensorKind,
     StatePart,
     TeamMemberPart,
@@ -45,10 +44,13 @@ from agent.estimation.motion import LAYOUTS
 from agent.estimation.mounting import mount_of
 from agent.fault_parts import FaultPart
 from agent.joint_room import check_room
-from agent.mavlink import MavlinkEndpointError, parse_endpoint
+from agent.mavlink_endpoint import MavlinkEndpointError, parse_endpoint
+from agent.motion_parts import OdometryPart
+from agent.planning_parts import PlanningPart, RoundPart
 from agent.sensor_input import SensorConfig
 from agent.settings import AgentSettings, nanoseconds
 from agent.start_config import InitialPart, check_start
+from agent.steering_link import SteeringSettings
 from agent.target_parts import AgentTargetPart, TrackingPart
 from agent.unsafe_parts import UnsafePart
 
@@ -104,10 +106,13 @@ class ZenohPart(Part):
 
 
 class MavlinkPart(Part):
-    """The autopilot's link and what is read from it."""
+    """The autopilot's link, what is read from it, and whether it is steered: see `agent.steering_link`."""
 
     endpoint: str
     simulated: bool = False
+    steer: bool = False
+    arm: bool = False
+    set_mode: bool = False
     fixes: list[Literal["position", "heading", "altitude"]] = []
     fix_sigma_m: Positive = 2.0
     fix_sigma_altitude_m: Positive = 3.0
@@ -138,7 +143,19 @@ class MavlinkPart(Part):
             position_source=self.position_source,
             max_speed_mps=self.max_speed_mps,
             max_distance_m=self.max_distance_m,
+            steering=SteeringSettings(self.arm, self.set_mode) if self.steer else None,
         )
+
+    def check_steering(self, planning: str) -> None:
+        """Nothing is steered that nobody plans for, or asked for that is not steered. Raises `ConfigError`."""
+        if self.steer and planning == "none":
+            raise ConfigError(
+                "mavlink.steer = true needs a planner: set planning.kind, or set mavlink.steer = false if the vehicle "
+                "is moved by others"
+            )
+        for key, value in (("arm", self.arm), ("set_mode", self.set_mode)):
+            if value and not self.steer:
+                raise ConfigError(f"mavlink.{key} = true needs mavlink.steer = true; set that too, or remove it")
 
 
 class InjectionPart(Part):
@@ -164,6 +181,8 @@ class AgentConfig(Part):
     tracking: TrackingPart = TrackingPart()
     lateness: LatenessPart = LatenessPart()
     health: HealthPart = HealthPart()
+    round: RoundPart = RoundPart()
+    planning: PlanningPart = PlanningPart()
     unsafe: UnsafePart = UnsafePart()
     coast: CoastPart = CoastPart()
     network: NetworkPart = NetworkPart()
@@ -217,6 +236,9 @@ class AgentConfig(Part):
             localization=localization,
             lateness=lateness,
             health=health,
+            # In a run all clocks begin at the same instant; in the field the epoch is what all have in common.
+            round=self.round.settings(start_ns if self.clock.source == "run" else 0),
+            planning=self.planning.settings(),
             unsafe=unsafe,
             coast=coast,
             track=self.tracking.kind != "none",
@@ -271,6 +293,8 @@ def load_agent_config(path: Path) -> AgentConfig:
         raise ConfigError(f"{path}: {error}") from None
     try:
         config.health.settings(config.localization.form)
+        config.round.settings()
+        config.planning.settings()
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     if config.localization.kind == "replica" and not config.team:
@@ -295,6 +319,11 @@ def load_agent_config(path: Path) -> AgentConfig:
         )
     except MavlinkEndpointError as error:
         raise ConfigError(f"{path}: mavlink.endpoint: {error}") from None
+    if config.mavlink is not None:
+        try:
+            config.mavlink.check_steering(config.settings(0).planning.kind)
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from None
     exposed = next((item for item in config.zenoh.listen if not _LOOPBACK.match(item)), None)
     if exposed is not None and not config.zenoh.insecure_lan:
         raise ConfigError(

@@ -19,12 +19,12 @@ from agent.estimation.motion import (
     StateLayout,
 )
 from agent.estimation.observation import Intrinsics
-from agent.estimation.odometry import OdometryNoise
 from agent.settings import (
     CoastSettings,
     HealthSettings,
     LatenessSettings,
     LocalizationSettings,
+    RoundWeights,
     TeamMember,
     UnsafeSettings,
     nanoseconds,
@@ -40,10 +40,11 @@ PROTECTED = UnsafeSettings()
 
 
 class LocalizationPart(Part):
-    kind: Literal["clat", "replica"] = "clat"
+    kind: Literal["clat", "replica", "jlatt"] = "clat"
     form: Literal["auto", "split_joint", "safe", "published", "joint"] = "auto"
-    transform: Literal["unscented", "linearized", "jacobian"] = "unscented"
+    transform: Literal["unscented", "linearized", "jacobian"] | None = None
     correlation: Literal["factors", "ignored"] = "factors"
+    weights: RoundWeights = "split_ci"
     pair_interval_s: NotNegative | None = None
     pair_timeout_s: Positive = 2.0
     innovation_cap: NotNegative | None = None
@@ -51,14 +52,21 @@ class LocalizationPart(Part):
     def settings(self) -> LocalizationSettings:
         """`safe` uses a contact of a pair every 3 s and trace weights; `published` every one and log det.
 
-        `split_joint` and `joint` use every contact, and cap innovations unless told otherwise; `replica` has no forms,
-        and caps them only if told. Raises `ConfigError` for what the kind does not have, and for a naive baseline of
-        `split_joint` and `joint`.
+        `split_joint` and `joint` use every contact, and cap innovations unless told otherwise; `replica` and `jlatt`
+        have no forms, and cap them only if told. `jlatt` is linearized, as in Su 2022: a transform
+        that allows for wrong headings makes beliefs vague that no correlation is known of. Raises `ConfigError` for
+        what the kind does not have, and for a naive baseline of `split_joint` and `joint`.
         """
-        if self.kind == "replica":
-            self._refuse_what_pairs_need()
+        if self.kind != "jlatt":
+            self._refuse("weights", "jlatt", f"kind '{self.kind}' has no rounds")
+        if self.kind != "clat":
+            for key in ("form", "correlation", "pair_interval_s"):
+                self._refuse(key, "clat", f"kind '{self.kind}' has no contacts of pairs")
             return LocalizationSettings(
-                kind="replica", transform=self.transform, innovation_cap=self.innovation_cap or 0.0
+                kind=self.kind,
+                transform=self.transform or ("jacobian" if self.kind == "jlatt" else "unscented"),
+                weights=self.weights,
+                innovation_cap=self.innovation_cap or 0.0,
             )
         joint = self.form in ("auto", "split_joint", "joint")
         if self.correlation == "ignored" and joint:
@@ -70,7 +78,7 @@ class LocalizationPart(Part):
         cap = self.innovation_cap if self.innovation_cap is not None else (9.0 if joint else 0.0)
         return LocalizationSettings(
             form=self.form,
-            transform=self.transform,
+            transform=self.transform or "unscented",
             correlation=self.correlation,
             sighting_weight="trace" if safe else "logdet",
             fusion_weight="fast" if safe else "logdet",
@@ -85,16 +93,12 @@ class LocalizationPart(Part):
             return "kind = 'replica'"
         return "form = 'joint'" if self.form == "joint" else None
 
-    def _refuse_what_pairs_need(self) -> None:
-        """Raises `ConfigError` for keys of kind `clat`; a default that is stated is none."""
-        plain = LocalizationPart()
-        for key in ("form", "correlation", "pair_interval_s"):
-            stated, default = getattr(self, key), getattr(plain, key)
-            if stated != default:
-                remedy = f"leave {key} out" if default is None else f"leave {key} out, or say {key} = {default!r}"
-                raise ConfigError(
-                    f"{key} = {stated!r} is of kind 'clat', and kind 'replica' has no contacts of pairs; {remedy}"
-                )
+    def _refuse(self, key: str, owner: str, why: str) -> None:
+        """Raises `ConfigError` for a key of another kind; a default that is stated is none."""
+        stated, default = getattr(self, key), getattr(LocalizationPart(), key)
+        if stated != default:
+            remedy = f"leave {key} out" if default is None else f"leave {key} out, or say {key} = {default!r}"
+            raise ConfigError(f"{key} = {stated!r} is of kind '{owner}', and {why}; {remedy}")
 
 
 class LatenessPart(Part):
@@ -257,43 +261,6 @@ def held_altitude(altitude_m: float, sigma_m: float) -> HeldAltitude:
 def start_size(layout: StateLayout) -> int:
     """Numbers of a start: a whole state, but for gains of an odometry, which start at 1."""
     return 3 if layout.heading == 2 else layout.dim
-
-
-class ControlPart(Part):
-    """Commanded motion; `altitude_m` is held by the model `quadrotor`, others climb."""
-
-    speed_mps: Finite = 0.0
-    yaw_rate_radps: Finite = 0.0
-    climb_mps: Finite = 0.0
-    altitude_m: Finite = 0.0
-
-
-class ControlNoisePart(Part):
-    """White noise on a control, held over the scenario's step (1 sigma); on a held altitude, of each instant."""
-
-    speed_mps: NotNegative = 0.0
-    yaw_rate_radps: NotNegative = 0.0
-    climb_mps: NotNegative = 0.0
-    altitude_m: NotNegative = 0.0
-    acceleration_mps2: NotNegative = 0.0
-    jerk_mps3: NotNegative = 0.0
-
-
-class OdometryPart(Part):
-    """Random-walk rates and calibrated gains of an odometry; see `agent.estimation.odometry`."""
-
-    along_m_per_sqrt_s: NotNegative = 0.02
-    along_m_per_sqrt_m: NotNegative = 0.0
-    across_m_per_sqrt_s: NotNegative = 0.0
-    vertical_m_per_sqrt_s: NotNegative = 0.02
-    heading_rad_per_sqrt_s: NotNegative = 0.005
-    heading_rad_per_sqrt_rad: NotNegative = 0.0
-    scale_along: Positive = 1.0
-    scale_turn: Positive = 1.0
-    lag_s: Finite = 0.0
-
-    def noise(self) -> OdometryNoise:
-        return OdometryNoise(**self.model_dump())
 
 
 class CalibrationPart(Part):

@@ -43,6 +43,11 @@ class CooperativeFilter(Protocol):
         ...
 
     @property
+    def complete_ns(self) -> int:
+        """Instant up to which all that neighbours bring is in: that of the newest state, or of the last round."""
+        ...
+
+    @property
     def revision(self) -> object:
         """An object that is another one whenever the estimate has changed."""
         ...

@@ -15,19 +15,32 @@ import numpy as np
 
 from agent.cooperative_filter import CooperativeFilter
 from agent.effects import Alarm, Effect, Estimate, Persist, Publish, Send
-from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError, absolute_model, relative_model, told
-from agent.events import ClockJudged, Event, Fix, LinkChange, Observation, Odometry, Received, Tick
+from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError
+from agent.events import (
+    ClockJudged,
+    ControlReport,
+    Event,
+    Fix,
+    LinkChange,
+    Observation,
+    Odometry,
+    PlannerOverrun,
+    Received,
+    Tick,
+)
 from agent.figures import MAX_KINDS, Figures, known
 from agent.forms import build_filter
 from agent.health import Health
+from agent.instant import Instant
 from agent.peer_work import PeerWork
+from agent.pilot import Pilot
 from agent.plausible import plausible
 from agent.replay import MAX_LOGGED, ReplayLog
 from agent.saved_state import decode, encode
 from agent.settings import AgentSettings
 from agent.timeline import MAX_INCREMENTS, MAX_WAITING, Item, OdometryTrack, Phase, Timeline
 from agent.waiting_filter import WaitingFilter
-from network.messages import PairReply, PairRequest, SplitReply, SplitRequest, StartRequest
+from network.messages import PairReply, PairRequest, RoundReport, SplitReply, SplitRequest, StartRequest
 
 
 class Agent:
@@ -56,6 +69,7 @@ class Agent:
         self._log: ReplayLog | None = None
         if replayed:
             self._log = ReplayLog(lateness.horizon_ns, lateness.tolerance_ns, self.filter.t_ns, self.counters)
+        self._pilot = Pilot(settings, self.counters) if settings.planning.kind != "none" else None
         self._again_until_ns = self.filter.t_ns
         self._commit()
         self._persisted: object = None
@@ -82,6 +96,8 @@ class Agent:
         settled_ns = self.now_ns - self.settings.lateness.settle_ns
         self.filter.settled(settled_ns if isinstance(event, Tick) else settled_ns - 1, effects)
         self.filter.expire(self.now_ns, effects)
+        if self._pilot is not None:
+            self._pilot.act(self.now_ns, self.filter, effects)
         if self.filter.revision is not self._published:
             self._published = self.filter.revision
             estimate = self.estimate()
@@ -148,6 +164,8 @@ class Agent:
         """When `handle` wants a `Tick` at the latest, should nothing else happen."""
         lateness = self.settings.lateness
         deadline = self.filter.deadline_ns()
+        if self._pilot is not None:
+            deadline = min(deadline, self._pilot.deadline_ns())
         item = self._timeline.peek()
         if item is not None:
             covered = self._covered(item.t_ns)
@@ -179,6 +197,7 @@ class Agent:
             "pairs": {peer: epoch.t_meas_ns for peer, epoch in self.filter.contacts().items()},
             "unsafe": self.settings.unsafe.named(),
             "health": self.health.status(self.now_ns),
+            **({} if self._pilot is None else {"steering": self._pilot.status()}),
             "counters": dict(self.counters),
         }
 
@@ -197,6 +216,14 @@ class Agent:
             case LinkChange():
                 with self._told(effects):
                     self.filter.link_changed(event)
+                if self._pilot is not None:
+                    self._pilot.link_changed(event)
+            case ControlReport(_, refused):
+                if self._pilot is not None:
+                    self._pilot.obeyed(refused)
+            case PlannerOverrun(t_ns):
+                if self._pilot is not None:
+                    self._pilot.overran(t_ns)
             case ClockJudged(_, peer, reason):
                 if reason is None:
                     self._clocks_off.discard(peer)
@@ -257,6 +284,8 @@ class Agent:
             self._start()
         else:
             self._drain(effects)
+            if self._pilot is not None and isinstance(body, RoundReport):
+                self._pilot.heard(event)
             with self._told(effects):
                 self.filter.heard(event, effects)
 
@@ -314,6 +343,9 @@ class Agent:
             self.filter.advance(t_ns, delta, cov)
         self._again_until_ns = max(self._again_until_ns, t_ns)
 
+    def _instant(self) -> Instant:
+        return Instant(self.settings, self.filter, self.counters, self._timeline, self._clocks_off, self.now_ns)
+
     # -- late data ------------------------------------------------------------------------------------------
 
     def _rewind(self) -> None:
@@ -333,14 +365,14 @@ class Agent:
     def _use(self, item: Item, effects: list[Effect]) -> None:
         """Process an item at its instant; what was used before doesn't count again."""
         if self._log is None:
-            self._process(item, effects)
+            self._instant().process(item, effects)
         elif isinstance(item.event, Received) or item.phase is Phase.PAIR:
             with self._told(effects):
-                self._process(item, effects)
+                self._instant().process(item, effects)
         else:
             late = item.t_ns < self.filter.t_ns - self.settings.lateness.tolerance_ns
             with self.figures.kept(self._log.used(item, self.filter.t_ns)):
-                self._process(item, effects)
+                self._instant().process(item, effects)
             if late:
                 self._commit()
 
@@ -358,67 +390,3 @@ class Agent:
         """What was used up to now is not to be used again."""
         if self._log is not None:
             self._log.commit(self.filter.t_ns, self.filter.mark(), self._odometry)
-
-    # -- one instant ----------------------------------------------------------------------------------------
-
-    def _process(self, item: Item, effects: list[Effect]) -> None:
-        event = item.event
-        if isinstance(event, Received):
-            started_by_peer = self.settings.shared is not None
-            if started_by_peer and item.t_ns <= self.settings.start_ns + self.settings.lateness.tolerance_ns:
-                # The belief at the start may have come of this very contact, told once more.
-                self.counters["start.told_again"] += 1
-                return
-            self.filter.requested(event, item.t_ns, effects)
-        elif isinstance(event, Fix):
-            fix = absolute_model(event.kind, self.settings.layout, event.z, event.R)
-            if fix is not None:
-                self.filter.absolute(item.t_ns, event.kind, *fix)
-            else:
-                self.counters["fix.unused_kind"] += 1
-        elif item.phase is Phase.PRIVATE:
-            self._landmark(item.t_ns, event)
-        elif item.phase is Phase.TARGET:
-            assert event.of is not None
-            self.filter.sighting(item.t_ns, event.of.removeprefix("target:"), event)
-        else:
-            self._contact(item.t_ns, event, effects)
-
-    def _landmark(self, t_ns: int, event: Observation) -> None:
-        assert event.of is not None
-        landmark = event.of.removeprefix("landmark:")
-        position = self.settings.landmarks.get(landmark)
-        if position is None:
-            self.counters["observation.unknown_landmark"] += 1
-            return
-        model = relative_model(event, self.settings.layout, landmark=position)
-        self.filter.absolute(t_ns, f"landmark_{event.kind}", model, event.z, event.R, landmark)
-
-    def _contact(self, t_ns: int, event: Observation, effects: list[Effect]) -> None:
-        """Open a contact for a measurement of a peer, with all measurements of that peer at this instant.
-
-        A two-way range is known to both robots: the lower id uses it.
-        """
-        assert event.of is not None
-        peer = event.of
-        events = [event]
-        while (item := self._timeline.peek()) is not None:
-            same = item.t_ns == t_ns and item.phase is Phase.PAIR and item.source == peer
-            if not same or not isinstance(item.event, Observation):
-                break
-            self._timeline.pop()
-            events.append(item.event)
-        measurements = []
-        for found in events:
-            two_way = found.kind == "range" and found.sensor not in self.settings.one_way_sensors
-            if two_way and peer < self.settings.robot:
-                self.counters["pair.not_owner"] += 1
-            else:
-                measurements.append(told(found))
-        if not measurements:
-            return
-        if peer in self._clocks_off and self.settings.localization.kind != "replica":
-            # Its answer would be of no known instant. Where raw data are told there is nothing to answer.
-            self.counters["observation.clock_unusable"] += len(measurements)
-            return
-        self.filter.measured(peer, t_ns, self.now_ns, tuple(measurements), effects)

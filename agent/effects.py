@@ -81,4 +81,17 @@ class Persist:
     ahead: bool = False
 
 
-Effect = Send | Broadcast | Publish | Alarm | Persist
+@dataclass(frozen=True, slots=True)
+class Steer:
+    """How the vehicle is to move from now until `until_ns` (own clock), and to stand still from then on.
+
+    velocity_mps  forward, left, up; body FLU
+    yaw_rate_radps  counter-clockwise
+    """
+
+    velocity_mps: tuple[float, float, float]
+    yaw_rate_radps: float
+    until_ns: int
+
+
+Effect = Send | Broadcast | Publish | Alarm | Persist | Steer

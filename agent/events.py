@@ -103,4 +103,19 @@ class ClockJudged:
     reason: str | None
 
 
-Event = Tick | Odometry | Fix | Observation | Received | LinkChange | ClockJudged
+@dataclass(frozen=True, slots=True)
+class ControlReport:
+    """What the autopilot says of being steered: None once it obeys, else why it does not, in a few words."""
+
+    t_ns: int
+    refused: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class PlannerOverrun:
+    """A plan took longer than it may: the next ones are made by the fallback."""
+
+    t_ns: int
+
+
+Event = Tick | Odometry | Fix | Observation | Received | LinkChange | ClockJudged | ControlReport | PlannerOverrun

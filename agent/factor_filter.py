@@ -66,6 +66,10 @@ class FactorFilter:
         return self.state.t_ns
 
     @property
+    def complete_ns(self) -> int:
+        return self.t_ns
+
+    @property
     def revision(self) -> object:
         return self.state
 

@@ -9,6 +9,7 @@ from agent.auto_filter import AutoFilter
 from agent.cooperative_filter import CooperativeFilter
 from agent.factor_filter import FactorFilter
 from agent.health import Health
+from agent.jlatt_filter import JlattFilter
 from agent.joint_filter import JointFilter
 from agent.replica_filter import ReplicaFilter
 from agent.saved_state import Saved, SavedFactors, SavedSplit
@@ -32,11 +33,15 @@ def build_filter(
     if isinstance(saved, SavedFactors):
         kept = JointFilter if settings.localization.form == "joint" else FactorFilter
         return kept(settings, counters, count_nis, saved, health=health)
+    if isinstance(saved, SavedSplit) and settings.localization.kind == "jlatt":
+        return JlattFilter(settings, counters, count_nis, saved, health=health)
     if isinstance(saved, SavedSplit):
         split = AutoFilter if settings.localization.form == "auto" else SplitFilter
         return split(settings, counters, count_nis, saved, health=health)
     if settings.source != "survey":
         return WaitingFilter(settings, counters)
+    if settings.localization.kind == "jlatt":
+        return JlattFilter(settings, counters, count_nis, health=health)
     if settings.localization.kind == "replica":
         return ReplicaFilter(settings, counters, count_nis)
     if settings.localization.form == "split_joint":

@@ -1,12 +1,4 @@
-"""The asyncio shell of the autopilot's link: sockets, serial line and timers around `agent.autopilot`.
-
-Endpoints, in MAVLink's usual notation:
-
-    udpin:HOST:PORT    listen; the vehicle's address is learnt from its first HEARTBEAT, all others are ignored
-    udpout:HOST:PORT   send to HOST:PORT and hear only it
-    tcp:HOST:PORT      connect, again and again with growing pauses
-    serial:DEVICE:BAUD open a serial line, likewise
-"""
+"""The asyncio shell of the autopilot's link: sockets, serial line and timers around `agent.autopilot`."""
 
 from __future__ import annotations
 
@@ -18,58 +10,21 @@ import termios
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from agent.autopilot import AutopilotReader, Output
+from agent.effects import Steer
 from agent.fleet_clock import FleetClock
+from agent.mavlink_endpoint import Endpoint, MavlinkError, parse_endpoint
 
-FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 MIN_WAIT_S = 0.0005
 MAX_WAIT_S = 1.0
 FIRST_PAUSE_S, LAST_PAUSE_S = 0.2, 5.0
 CONNECT_TIMEOUT_S = 5.0
+REACHED_TRIES, REACHED_PAUSE_S = 50, 0.1
 ADDRESS_SILENT_S = 5.0
 MAX_UNSENT_BYTES = 32_768
 READ_BYTES = 4096
-
-
-class MavlinkError(Exception):
-    """The link cannot be opened; one line that says what to change."""
-
-
-class MavlinkEndpointError(MavlinkError, ValueError):
-    """The text of an endpoint is wrong."""
-
-
-@dataclass(frozen=True, slots=True)
-class Endpoint:
-    """A parsed endpoint: `number` is a port, or the baud rate of a serial line."""
-
-    text: str
-    kind: str
-    place: str
-    number: int
-
-    @property
-    def is_loopback(self) -> bool:
-        """Whether the other end can only be on this computer."""
-        return self.kind != "serial" and (self.place in ("localhost", "::1") or self.place.startswith("127."))
-
-
-def parse_endpoint(text: str) -> Endpoint:
-    """Raises `MavlinkEndpointError` (a ValueError) that names the text and the valid forms."""
-    kind, _, rest = text.partition(":")
-    place, _, number = rest.rpartition(":")
-    if kind not in ("udpin", "udpout", "tcp", "serial") or not place or not (number.isascii() and number.isdigit()):
-        raise MavlinkEndpointError(f"MAVLink endpoint '{text}' is not one of {FORMS}")
-    value = int(number)
-    if kind == "serial":
-        if not hasattr(termios, f"B{value}") or value == 0:
-            raise MavlinkEndpointError(f"MAVLink endpoint '{text}': {value} is not a baud rate of this system")
-    elif not 0 < value < 65536:
-        raise MavlinkEndpointError(f"MAVLink endpoint '{text}': the port must be from 1 to 65535")
-    return Endpoint(text, kind, place.strip("[]"), value)
 
 
 class Timer:
@@ -359,9 +314,31 @@ class MavlinkLink:
         await self._line.start()
         self._serve()
 
+    async def reached(self) -> None:
+        """A stream must be there at the start, for a wrong address must not go unnoticed; later it is redialled.
+
+        Raises `MavlinkError` if it is not.
+        """
+        if self._endpoint.kind in ("udpin", "udpout"):
+            return
+        for _ in range(REACHED_TRIES):
+            if self.connected:
+                return
+            await asyncio.sleep(REACHED_PAUSE_S)
+        text = self._endpoint.text
+        raise MavlinkError(f"mavlink.endpoint {text}: nothing answers; start the autopilot or correct the endpoint")
+
     async def close(self) -> None:
+        """A vehicle that is steered is told to stand still first."""
         self._timer.cancel()
+        for frame in self._reader.parting(self._clock.now_ns()):
+            self._line.send(frame)
         await self._line.close()
+
+    def steer(self, steer: Steer) -> None:
+        """Have the vehicle move so from now on."""
+        self._reader.steer(steer)
+        self._serve()
 
     def _on_opened(self) -> None:
         self._reader.new_stream()
@@ -391,4 +368,6 @@ class MavlinkLink:
             return
         for frame in self._reader.outgoing(now_ns):
             self._line.send(frame)
+        for report in self._reader.reports(now_ns):
+            self._emit(report)
         self._timer.arm(self._reader.next_deadline_ns())

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from agent.core import Agent
-from agent.effects import Alarm, Broadcast, Effect, Estimate, Persist, Publish, Send
+from agent.effects import Alarm, Broadcast, Effect, Estimate, Persist, Publish, Send, Steer
 from agent.events import ClockJudged, Event, LinkChange, Received, Tick
 from agent.figures import NisSum
 from agent.sensor_input import SensorConfig, SensorError, decode
@@ -24,6 +24,7 @@ Recorder = Callable[[Event, list[Effect]], None]
 class Outgoing:
     """What a shell has to carry out: a state to keep first, then packets to send, and estimates to show.
 
+    `steer` is the newest command to the vehicle, which replaces the one before.
     `persist` is the newest state, and `ahead` if a packet must not leave before one is kept that is as new.
     """
 
@@ -31,6 +32,7 @@ class Outgoing:
     estimates: list[Estimate] = field(default_factory=list)
     alarms: list[Alarm] = field(default_factory=list)
     persist: Persist | None = None
+    steer: Steer | None = None
     next_life: int | None = None
     """A new life is due, of this incarnation, see `network.own_life`."""
 
@@ -162,6 +164,8 @@ class Node:
                     out.estimates.append(estimate)
                 case Alarm():
                     out.alarms.append(effect)
+                case Steer():
+                    out.steer = effect
                 case Persist(payload):
                     before = out.persist is not None and out.persist.ahead
                     out.persist = Persist(payload, True) if before else effect

@@ -20,6 +20,7 @@ from network.messages import (
     JointSnapshot,
     PairReply,
     PairRequest,
+    RoundReport,
     Snapshot,
     SplitReply,
     SplitRequest,
@@ -37,9 +38,19 @@ SUREST = 1e-14
 
 def plausible(body: Body) -> bool:
     """Whether what a peer tells of itself and of targets can be so; of a body without beliefs it always can."""
+    if isinstance(body, RoundReport):
+        return _round_possible(body)
     if not isinstance(body, PairRequest | PairReply | SplitRequest | SplitReply) or body.snapshot is None:
         return True
     return all(_possible(*part) for part in _beliefs(body.snapshot))
+
+
+def _round_possible(report: RoundReport) -> bool:
+    beliefs = (report.belief, *(target.belief for target in report.targets))
+    corrections = ((item.place, (item.sensor + item.pose).diagonal()) for item in report.corrections)
+    return all(_possible(belief.model, belief.mean, belief.cov.diagonal()) for belief in beliefs) and all(
+        np.abs(place).max() <= FARTHEST and variances.min() >= SUREST for place, variances in corrections
+    )
 
 
 def _beliefs(told: Snapshot | JointSnapshot | SplitSnapshot) -> Iterator[tuple[str, Array, Array]]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -34,7 +35,7 @@ _TYPES: dict[str, type] = {
     for name, value in vars(module).items()
     if isinstance(value, type) and is_dataclass(value)
 }
-_TYPES["ReplyStatus"] = message_types.ReplyStatus
+_ENUMS = {kind.__name__: kind for kind in (message_types.ReplyStatus, message_types.RoundStage)}
 
 
 class RecordingError(ValueError):
@@ -44,8 +45,8 @@ class RecordingError(ValueError):
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return {"@": "array", "shape": list(value.shape), "data": np.ascontiguousarray(value, "<f8").tobytes()}
-    if isinstance(value, message_types.ReplyStatus):
-        return {"@": "ReplyStatus", "value": int(value)}
+    if isinstance(value, IntEnum):
+        return {"@": type(value).__name__, "value": int(value)}
     if is_dataclass(value) and not isinstance(value, type):
         return {"@": type(value).__name__, **{f.name: _plain(getattr(value, f.name)) for f in fields(value)}}
     if isinstance(value, (tuple, list)):
@@ -65,8 +66,8 @@ def _object(value: Any) -> Any:
     name = value.get("@")
     if name == "array":
         return np.frombuffer(value["data"], "<f8").reshape(value["shape"]).copy()
-    if name == "ReplyStatus":
-        return message_types.ReplyStatus(value["value"])
+    if name in _ENUMS:
+        return _ENUMS[name](value["value"])
     if name == "frozenset":
         return frozenset(value["items"])
     if name is None:

@@ -68,6 +68,10 @@ class ReplicaFilter:
         return self._history.t_ns
 
     @property
+    def complete_ns(self) -> int:
+        return self.t_ns
+
+    @property
     def revision(self) -> object:
         return self._revision
 

@@ -19,6 +19,12 @@ SMOOTHING = 0.1
 MAX_NAMES = 64
 
 
+def command_long(vehicle: tuple[int, int], number: int, *parameters: float) -> Any:
+    """COMMAND_LONG to (system, component); parameters that are not given are 0."""
+    filled = [*parameters, *[0.0] * (7 - len(parameters))]
+    return dialect.MAVLink_command_long_message(*vehicle, number, 0, *filled)
+
+
 @dataclass(slots=True)
 class Wanted:
     """A message to ask for by SET_MESSAGE_INTERVAL every `interval_ns` of fleet time."""

@@ -4,7 +4,7 @@ Who keeps correlation factors (`safe`, `published`, `joint`) goes on with them. 
 the last message of a contact: what peers have been told is in them as lines and bases then, and what was learnt since
 is forgotten by one side only, as if a reply had been lost (`agent.pairing`). The shell writes before it sends.
 
-Who keeps none (`split_joint`, and `auto` whatever its form was) begins with its belief, all of which counts as shared,
+Who keeps none (`split_joint`, `auto`, the kind `jlatt`) begins with its belief, all of which counts as shared,
 correlated with everybody's in an unknown way. That holds however old the bytes are and whatever was said since.
 
 Either way the state is of its instant, and the robot coasts from there: it does not know how it moved meanwhile.
@@ -27,7 +27,7 @@ from agent.estimation.split_joint import Split
 from agent.health import SavedVerdict
 from agent.joint_layout import JointLayout
 from agent.joint_tracks import JointState, RelayedTrack
-from agent.settings import AgentSettings
+from agent.settings import AgentSettings, LocalizationSettings
 from agent.state_fields import (
     StateError,
     read_amount,
@@ -145,7 +145,7 @@ def begun_again(settings: AgentSettings) -> AgentSettings:
     whole belief counts as shared. A fix, or a place that a peer tells, is new information, and needs nothing.
     """
     localization = settings.localization
-    if settings.source != "survey" or localization.kind == "replica" or settings.unsafe.trust_restarts:
+    if settings.source != "survey" or localization.kind in ("replica", "jlatt") or settings.unsafe.trust_restarts:
         return settings
     if localization.form in ("auto", "split_joint"):
         return replace(settings, shared=settings.cov, found_out=True)
@@ -179,16 +179,24 @@ def given_up(settings: AgentSettings, payload: bytes) -> bytes | None:
 
 def encode(settings: AgentSettings, saved: Saved, verdicts: dict[str, SavedVerdict]) -> bytes:
     """The bytes of a state of a robot of these settings, and of its verdicts on peers."""
+    form: str
     if isinstance(saved, SavedFactors):
         form, body = settings.localization.form, _factors(settings, saved)
     else:
-        form, body = "split_joint", _split(settings, saved)
+        form, body = _form(settings.localization), _split(settings, saved)
     state = saved.state
     head = FORMAT, settings.robot, form, settings.layout.name, settings.start_ns, state.t_ns
     payload: bytes = msgpack.packb(
         [*head, _bytes(state.mean), _bytes(saved.state.cov), body, _verdicts(verdicts)]
     )
     return payload
+
+
+def _form(localization: LocalizationSettings) -> str:
+    """What a state that fits these settings calls itself."""
+    if localization.kind != "clat":
+        return localization.kind
+    return "split_joint" if localization.form == "auto" else localization.form
 
 
 def _bytes(array: Array) -> bytes:
@@ -273,18 +281,17 @@ def _decoded(raw: Any, settings: AgentSettings) -> Restored:
     if raw[0] != FORMAT:
         raise StateError("other_version")
     _, robot, form, model, start, instant, mean, cov, body, verdicts = read_fields(raw, 10)
-    localization = settings.localization
     if read_id(robot) != settings.robot:
         raise StateError("other_robot")
-    expected = "split_joint" if localization.form == "auto" else localization.form
-    if localization.kind != "clat" or read_text(form) != expected:
+    expected = _form(settings.localization)
+    if expected == "replica" or read_text(form) != expected:
         raise StateError("other_form")
     if read_text(model) != settings.layout.name:
         raise StateError("other_model")
     start_ns, t_ns = read_stamp(start), read_stamp(instant)
     if start_ns > t_ns:
         raise StateError("inconsistent")
-    read = _read_split if expected == "split_joint" else _read_factors
+    read = _read_split if expected in ("split_joint", "jlatt") else _read_factors
     return Restored(start_ns, read(settings, t_ns, mean, cov, body), read_by_id(verdicts, 5, _read_verdict))
 
 

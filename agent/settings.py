@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields
 from typing import Literal
 
@@ -16,6 +17,9 @@ Array = NDArray[np.float64]
 
 NS = 1_000_000_000
 
+RoundWeights = Literal["split_ci", "trace", "logdet", "info", "pinv_guard"]
+"""How information that may be correlated is weighed: see `agent.estimation.jlatt`."""
+
 
 def nanoseconds(seconds: float) -> int:
     """Seconds as integer nanoseconds, rounded to the nearest."""
@@ -24,8 +28,10 @@ def nanoseconds(seconds: float) -> int:
 
 @dataclass(frozen=True, slots=True)
 class LocalizationSettings:
-    """Cooperative localization: `clat`, by contacts of pairs, or `replica`, by raw data told to the whole team.
+    """Cooperative localization: `clat`, by contacts of pairs; `replica`, by raw data told to the whole team;
+    `jlatt`, by rounds in which neighbours tell their beliefs.
 
+    weights                           how `jlatt` weighs what may be correlated
     sighting_weight / fusion_weight   how intersections choose their weight
     pair_interval_ns                  least time between two contacts of a pair that are used
     pair_timeout_ns                   a request unanswered for this long is forgotten
@@ -33,7 +39,7 @@ class LocalizationSettings:
     max_lines                         identity lines kept per peer
     """
 
-    kind: Literal["clat", "replica"] = "clat"
+    kind: Literal["clat", "replica", "jlatt"] = "clat"
     form: Literal["auto", "split_joint", "safe", "published", "joint"] = "auto"
     transform: Transform = "unscented"
     correlation: Literal["factors", "ignored"] = "factors"
@@ -44,7 +50,74 @@ class LocalizationSettings:
     innovation_cap: float = 0.0
     max_lines: int = 24
     restart_interval_ns: int = 60 * NS
+    weights: RoundWeights = "split_ci"
     parameters: UnscentedParameters = DEFAULT
+
+
+@dataclass(frozen=True, slots=True)
+class RoundSettings:
+    """When robots tell each other what an instant brought: at whole multiples of `period_ns` since `anchor_ns`.
+
+    wait_ns  a round ends when all neighbours have told, or this long after its instant
+    lean     one message per round: plans are made of what is told before the corrections
+    """
+
+    period_ns: int = NS
+    anchor_ns: int = 0
+    wait_ns: int = NS // 5
+    lean: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SensingSettings:
+    """What a planner knows of the sensor that sees targets and peers: a range and bearing within its field of view."""
+
+    min_range_m: float = 2.0
+    max_range_m: float = 15.0
+    fov_rad: float = math.pi / 3.0
+    sigma_m: float = 0.0
+    sigma_m_per_m: float = 0.03
+    sigma_rad: float = math.pi / 180.0
+
+
+@dataclass(frozen=True, slots=True)
+class PlanningSettings:
+    """How a robot chooses its motion (Su 2022, chapter 3; `agent.planning`).
+
+    kind             `none`: it does not; `random`; `potential` (AJLATT-C); `optimal` (AJLATT-O)
+    form             of `potential` and `optimal`: `improved`, or as `published`
+    max_speed_mps, max_turn_radps  what the vehicle can do; it never drives backwards
+    speed_share, heading_rad_per_m  deviations of the odometry, as a share of the way and in heading per metre
+    closest_m, apart_m  robots and the target push each other off below `apart_m`, and hardest at `closest_m`
+    radio_range_m    neighbours are in reach within this distance
+    self_weight, target_weight  alpha_R and alpha_T of eq. 3.7: how much own and target's uncertainty cost
+    potential_weight  beta of eq. 3.7
+    ahead, horizon   t1 and t2 of eq. 3.7, in rounds
+    candidates       most commands that `optimal` evaluates per round
+    weights          the rule of the corrections that `optimal` predicts
+    seed             of the kind `random`
+    overrun_ns       a plan that takes longer took too long
+    """
+
+    kind: Literal["none", "random", "potential", "optimal"] = "none"
+    form: Literal["improved", "published"] = "improved"
+    max_speed_mps: float = 0.5
+    max_turn_radps: float = math.pi / 5.0
+    speed_share: float = 0.0070710678118654755
+    heading_rad_per_m: float = 0.0282842712474619
+    closest_m: float = 6.0
+    apart_m: float = 10.0
+    radio_range_m: float = 30.0
+    self_weight: float = 0.2
+    target_weight: float = 1.0
+    potential_weight: float = 1.0
+    ahead: int = 4
+    horizon: int = 11
+    candidates: int = 61
+    weights: RoundWeights = "split_ci"
+    sensing: SensingSettings = SensingSettings()
+    seed: int = 0
+    overrun_ns: int = NS // 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,6 +256,8 @@ class AgentSettings:
     lateness: LatenessSettings = field(default_factory=LatenessSettings)
     coast: CoastSettings = field(default_factory=CoastSettings)
     health: HealthSettings = HealthSettings()
+    round: RoundSettings = RoundSettings()
+    planning: PlanningSettings = PlanningSettings()
     unsafe: UnsafeSettings = UnsafeSettings()
     track: bool = True
     team: tuple[TeamMember, ...] = ()

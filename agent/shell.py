@@ -15,7 +15,9 @@ import secrets
 import signal
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +28,14 @@ from agent.config import AgentConfig
 from agent.config_file import ConfigError
 from agent.control import ControlLine
 from agent.effects import Alarm
-from agent.events import Event
+from agent.events import ControlReport, Event, PlannerOverrun
 from agent.fleet_clock import FleetClock
 from agent.injection import Injection
 from agent.live_recording import LiveRecording
-from agent.mavlink import MavlinkError, MavlinkLink
+from agent.mavlink import MavlinkLink
 from agent.node import Node, Outgoing, rejected
 from agent.node_timer import NodeTimer
+from agent.plan_timer import PlanTimer
 from agent.publications import Publications
 from agent.sensor_socket import SensorSocket
 from agent.settings import nanoseconds
@@ -68,6 +71,8 @@ class AgentShell:
         self._receive: Any = None
         self._timer = NodeTimer(lambda: self._clock, self._on_timer)
         self._start_ns = 0
+        overrun_ns = config.settings(0).planning.overrun_ns
+        self._plans = PlanTimer(round(overrun_ns / config.clock.speed), time.perf_counter_ns)
         self._publications = Publications()
         self._stop = asyncio.Event()
         self.counters: Counter[str] = Counter()
@@ -202,7 +207,7 @@ class AgentShell:
             self._reader = AutopilotReader(config.mavlink.settings(list(config.origin)))
             self._mavlink = MavlinkLink(config.mavlink.endpoint, self._reader, self._clock, self.on_event)
             await self._mavlink.start()
-            await self._reached(config.mavlink.endpoint)
+            await self._mavlink.reached()
         self._arm()
 
     def _living(self, begin: Start) -> Node:
@@ -244,17 +249,6 @@ class AgentShell:
         self._keeper.begin(begin, reason, self._found.refused)
         return begin
 
-    async def _reached(self, endpoint: str) -> None:
-        """A stream must be there at the start, for a wrong address must not go unnoticed; later it is redialled."""
-        assert self._mavlink is not None
-        if endpoint.startswith("udp"):
-            return
-        for _ in range(50):
-            if self._mavlink.connected:
-                return
-            await asyncio.sleep(0.1)
-        raise MavlinkError(f"mavlink.endpoint {endpoint}: nothing answers; start the autopilot or correct the endpoint")
-
     # -- work -----------------------------------------------------------------------------------------------
 
     async def _work(self) -> None:
@@ -277,20 +271,29 @@ class AgentShell:
     def on_sensor(self, data: bytes) -> None:
         """A datagram on the sensor socket."""
         if self._node is not None:
-            self._carry_out(self._node.on_sensor(self._clock.now_ns(), data))
+            self._take(partial(self._node.on_sensor, self._clock.now_ns(), data))
 
     def on_event(self, event: Event) -> None:
         """An event of the autopilot's reader."""
+        if isinstance(event, ControlReport):
+            log.warning("steering: %s", event.refused or "the vehicle obeys")
         if self._node is not None:
-            self._carry_out(self._node.on_event(event))
+            self._take(partial(self._node.on_event, event))
 
     def _on_packet(self, packet: Packet) -> None:
         if self._node is not None:
-            self._carry_out(self._node.on_packet(self._clock.now_ns(), packet))
+            self._take(partial(self._node.on_packet, self._clock.now_ns(), packet))
 
     def _on_timer(self, now_ns: int) -> None:
         assert self._node is not None
-        self._carry_out(self._node.on_tick(now_ns))
+        self._take(partial(self._node.on_tick, now_ns))
+
+    def _take(self, call: Callable[[], Outgoing]) -> None:
+        """Let the node take something, carry out what comes of it, and tell it if that took too long."""
+        out, overran = self._plans.timed(call)
+        self._carry_out(out)
+        if overran:
+            self.on_event(PlannerOverrun(self._clock.now_ns()))
 
     def _carry_out(self, out: Outgoing) -> None:
         assert self._transport is not None and self._keeper is not None
@@ -302,6 +305,8 @@ class AgentShell:
                 self.counters["state.held_back"] += 1
         for alarm in (*out.alarms, *self._troubles()):
             self._publications.warn(alarm)
+        if out.steer is not None and self._mavlink is not None:
+            self._mavlink.steer(out.steer)
         if out.next_life is not None:
             self._succeed(out.next_life)
         if out.estimates and (estimate := self._publications.estimate(out.estimates[-1])) is not None:
@@ -341,7 +346,7 @@ class AgentShell:
                 found.append(Alarm(f"{name}.failed", file.failure))
         return found
 
-    def _figures(self) -> dict[str, Any]:
+    def figures(self) -> dict[str, Any]:
         """What the launcher needs for the summary."""
         assert self._node is not None and self._transport is not None
         agent = self._node.agent
@@ -354,6 +359,7 @@ class AgentShell:
             "autopilot": dict(self._reader.counters) if self._reader is not None else {},
             "lag_max_s": self._timer.lags.max_ns * 1e-9,
             "lags": self._timer.lags.told(),
+            "plan_us": self._plans.told(),
         }
 
     # -- end ------------------------------------------------------------------------------------------------
@@ -362,7 +368,7 @@ class AgentShell:
         self._timer.cancel()
         if self._hearing is not None:
             self._hearing.cancel()
-        figures = self._figures() if self._node is not None else None
+        figures = self.figures() if self._node is not None else None
         state = self._node.agent.saved() if self._node is not None else None
         self._node = None
         self._receive = _ignore

@@ -91,6 +91,10 @@ class SplitFilter:
         return self.state.t_ns
 
     @property
+    def complete_ns(self) -> int:
+        return self.t_ns
+
+    @property
     def revision(self) -> object:
         return self.state
 

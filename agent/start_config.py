@@ -61,6 +61,10 @@ def check_start(
             f"source = '{source}' does not go with {rigid}, which takes all robots to start together; "
             "take form = 'split_joint'"
         )
+    if source == "peer" and localization.kind == "jlatt":
+        raise ConfigError(
+            "source = 'peer' does not go with kind = 'jlatt', where nobody asks a single peer; take 'fix' or 'survey'"
+        )
     missing = []
     if source == "fix" and not ({"position", "pose"} & {*kinds} or "position" in fixes):
         missing.append(A_PLACE)

@@ -8,8 +8,9 @@ from typing import Literal
 import numpy as np
 
 from agent.config_file import ConfigError, Finite, Id, Part, Positive
-from agent.config_parts import ControlNoisePart, ControlPart, LocalizationPart, SigmaPart, held_altitude
+from agent.config_parts import LocalizationPart, SigmaPart, held_altitude
 from agent.estimation.motion import LAYOUTS, SPATIAL, TargetMotion
+from agent.motion_parts import ControlNoisePart, ControlPart
 from agent.settings import TargetSettings, TrackEnd, nanoseconds
 
 TargetModel = Literal[
@@ -87,7 +88,7 @@ def target_motion(
 ) -> TargetMotion:
     """The motion model a table describes. Raises `ConfigError` for a held altitude without noise."""
     layout, held = LAYOUTS[model], None
-    sigma: tuple[float, ...] = (noise.speed_mps, noise.yaw_rate_radps)
+    sigma: tuple[float, ...] = noise.deviations(control.speed_mps)
     if layout is SPATIAL:
         held = held_altitude(control.altitude_m, noise.altitude_m)
     elif layout.heading is None:

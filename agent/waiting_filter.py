@@ -56,6 +56,10 @@ class WaitingFilter:
         return self._t_ns
 
     @property
+    def complete_ns(self) -> int:
+        return self.t_ns
+
+    @property
     def revision(self) -> object:
         """There is no estimate that could change."""
         return None

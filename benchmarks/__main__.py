@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from benchmarks import exchange, fleet, kernel
+from benchmarks import exchange, fleet, kernel, planner
 
 Step = Callable[[], object]
 
@@ -76,6 +76,14 @@ def pair_exchange() -> Result:
     return Result("pair exchange above a bare round trip over Zenoh [ms]", added_ms, "< 1", added_ms < 1.0, note)
 
 
+def plan() -> Result:
+    """Time of one robot's choice by predicted beliefs."""
+    found = planner.choice()
+    what = f"choice of motion, kind optimal, {planner.NEIGHBOURS} neighbours [ms]"
+    note = f"{found.single_s / found.batch_s:.0f} times as long with one candidate after the other"
+    return Result(what, found.batch_s * 1e3, "<= 5", found.batch_s <= 5e-3, note)
+
+
 def processes(rate_hz: float, count: int, required: bool = True) -> Result:
     """Lag of all agents' timers, 99th percentile, in periods."""
     found = fleet.processes(count, rate_hz, 20.0)
@@ -95,6 +103,7 @@ def main() -> int:
         lambda: against("Stone Soup UKF", kernel.stone_soup, 0.1),
         lambda: engine("every contact", 0.0, 5.0),
         lambda: engine("one contact per pair and second", 1.0, 12.0),
+        plan,
         pair_exchange,
         fleet_memory,
     ]

@@ -62,6 +62,8 @@ def agent_file(
         "odometry": odometry_table(scenario, robot),
         "rate_hz": 1.0 / scenario.step_s,
     }
+    if scenario.planning_of(robot).kind != "none":
+        mavlink |= {"steer": True, "arm": True, "set_mode": True}
     if fix is not None:
         sensor = robot.sensors[fix]
         mavlink |= {"fixes": ["position"], "fix_sigma_m": sensor.sigma_m, "fix_interval_s": 0.0}

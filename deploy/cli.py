@@ -190,7 +190,7 @@ def _montecarlo(options: argparse.Namespace) -> int:
 
 def _agent(options: argparse.Namespace) -> int:
     from agent.config import load_agent_config
-    from agent.mavlink import MavlinkError
+    from agent.mavlink_endpoint import MavlinkError
     from agent.shell import AgentShell
     from network.transport import TransportError
 

@@ -25,6 +25,7 @@ from sim.engine import TrialResult, network_figures
 from sim.fault_plan import trial_faults
 from sim.faulty_world import FaultyWorld
 from sim.metrics import TrialTrace
+from sim.motion_figures import trial_motion
 from sim.sampling import MeasurementLog, Sampler
 from sim.scenario import Scenario
 from sim.world import World
@@ -65,6 +66,7 @@ def collect(
             if row_index is not None:
                 for entity in (*world.robots, *world.targets):
                     sampler.put_bound(entity, row_index, runner.belief(entity))
+    instants = measured.instants()
     return TrialResult(
         sampler.trace(),
         contacts,
@@ -72,7 +74,8 @@ def collect(
         dict(sorted(rejected.items())),
         nis,
         counters,
-        measured=measured.instants(),
+        trial_motion(scenario, world, instants, world.steps),
+        measured=instants,
     )
 
 
@@ -85,6 +88,8 @@ def _sampled(
     scenario: Scenario, world: World, run_dir: Path, t0_ns: int, seed: int, with_bound: bool
 ) -> tuple[Sampler, list[tuple[float, str, str]]]:
     """Estimates at sampled instants, and the contacts in order."""
+    if world.closed_loop:
+        raise ValueError("nobody but the run's world knows where its robots went: take `sim.trial.played_world`")
     clocks = Clocks(scenario, seed, t0_ns)
     measured = Measured(scenario, clocks)
     sampler = Sampler(scenario, world, with_bound)

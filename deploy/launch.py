@@ -32,6 +32,7 @@ from deploy.live_faults import LiveFaults
 from deploy.member import Member, spawn
 from deploy.process_faults import ProcessFaults
 from network.transport import free_port
+from sim.closed_loop import MOTION
 from sim.host import HostPlan, plan_json
 from sim.scenario import Scenario
 from sim.world import World
@@ -163,6 +164,7 @@ class Launcher:
             link_endpoint=f"tcp/127.0.0.1:{port()}",
             mavlink_ports={name: port() for name in robots},
             sensor_sockets={name: str(private / name / "sensors.sock") for name in robots},
+            motion=str(self._run_dir / MOTION),
             namespaces={name: host.namespace for name, host in self._hosts.items()},
         )
         (private / "plan.json").write_text(plan_json(plan))

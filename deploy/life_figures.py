@@ -18,5 +18,6 @@ def summed(lives: list[dict[str, Any]]) -> dict[str, Any]:
             entry[0], entry[1] = entry[0] + value, entry[1] + count
         total["nis"] = nis
         total["lag_max_s"] = max(total["lag_max_s"], figures["lag_max_s"])
-        total["lags"] = total["lags"] + figures["lags"]
+        for key in ("lags", "plan_us"):
+            total[key] = total[key] + figures[key]
     return total

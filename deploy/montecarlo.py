@@ -6,6 +6,7 @@ import argparse
 import json
 import shlex
 import signal
+import statistics
 import sys
 import time
 from collections.abc import Iterator
@@ -182,6 +183,8 @@ def _conclude(
         timing = {"wall_s": time.perf_counter() - started}
         if steps:
             timing["step_us_median"] = steps[len(steps) // 2]
+        if plans := [median for trial in trials.values() for median in trial["plan_us"]]:
+            timing["plan_us_median"] = statistics.median(plans)
         summary = summarize(
             series.scenario,
             "virtual",
@@ -226,7 +229,7 @@ def _compare(top: Path, planned: list[Series], summaries: dict[str, dict[str, An
 
 
 def _table(series: Series, first: int, trials: dict[int, dict[str, Any]]) -> None:
-    rows = {seed: trial_figures(trial["figures"]) for seed, trial in trials.items()}
+    rows = {seed: trial_figures(trial["figures"]) | trial["motion"] for seed, trial in trials.items()}
     write_trials(series.run_dir / "trials.csv", first, rows)
 
 

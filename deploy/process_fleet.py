@@ -23,9 +23,10 @@ from deploy.launch import TOLD_S, Launcher, LaunchError
 from deploy.member import Member
 from deploy.runs import write_scenario
 from sim.agents import table
+from sim.closed_loop import MOTION
 from sim.metrics import StateTrace
 from sim.scenario import Scenario
-from sim.trial import open_world
+from sim.trial import open_world, played_world
 
 PAUSE_S = 0.05
 SETTLE_S = 0.3
@@ -137,7 +138,8 @@ class ProcessFleet(Fleet):
         self._heard(self.robots)
         self._check()
         played = self._launcher.played()
-        return until(trace_of(played, self._world, self.run_dir, self._launcher.t0_ns, self.seed), t_s)
+        world = played_world(self.scenario, self.seed, self.run_dir / MOTION)
+        return until(trace_of(played, world, self.run_dir, self._launcher.t0_ns, self.seed), t_s)
 
     def status(self, robot: str) -> dict[str, Any]:
         self._heard((robot,))

@@ -7,6 +7,7 @@ import asyncio
 import csv
 import json
 import shlex
+import statistics
 import sys
 import time
 from collections.abc import Sequence
@@ -26,13 +27,15 @@ from deploy.launch import Launcher, LaunchError
 from deploy.status import LiveTable, Progress, print_summary
 from network.links import FATE_COLUMNS, FateRecord, fate_row
 from sim.agents import agent_config, table
+from sim.closed_loop import MOTION
 from sim.engine import TrialResult
 from sim.invariants import InvariantBreach, InvariantChecker
 from sim.scenario import Scenario
 from sim.scenario_file import load
+from sim.sight import views
 from sim.store import load_trace, save_trace
 from sim.summary import reduce, summarize, unmet
-from sim.trial import open_world, run_trial
+from sim.trial import open_world, played_world, run_trial
 
 DEMO = "demo"
 
@@ -81,13 +84,18 @@ def run(options: argparse.Namespace) -> int:
         lag_p99_s = lags.percentile_ns(0.99) * 1e-9
         scenario = launcher.played()
         write_scenario(scenario, run_dir)
+        world = played_world(scenario, options.seed, run_dir / MOTION)
         result = collect(scenario, world, run_dir, outcome, options.bound, options.seed)
+        for figures in outcome.figures.values():
+            result.plan_us.extend(figures["plan_us"] if figures else ())
         merge_recordings(scenario, run_dir)
         merge_fates(scenario, run_dir)
     steps = sorted(result.step_us)
     timing = {"wall_s": time.perf_counter() - started, "lag_max_s": lag_max_s, "lag_p99_s": lag_p99_s}
     if steps:
         timing["step_us_median"] = steps[len(steps) // 2]
+    if result.plan_us:
+        timing["plan_us_median"] = statistics.median(result.plan_us)
     summary = summarize(
         scenario,
         runtime,
@@ -97,7 +105,7 @@ def run(options: argparse.Namespace) -> int:
         timing=timing,
         exits=exits,
     )
-    save_trace(run_dir, result.trace, result.contacts, world.landmarks, result.measured)
+    save_trace(run_dir, result.trace, result.contacts, world.landmarks, result.measured, views(scenario))
     report = write_results(scenario, run_dir, summary, options.arguments, draw=not options.no_report)
     if options.json:
         print(json.dumps(summary, allow_nan=False))

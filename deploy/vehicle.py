@@ -1,4 +1,7 @@
-"""`cofix sitl`: an autopilot stand-in that drives a circle in real time, to try an agent's MAVLink link on a desk."""
+"""`cofix sitl`: an autopilot stand-in that drives a circle in real time, to try an agent's MAVLink link on a desk.
+
+Armed and in its mode for it, it obeys set-points instead.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,11 @@ import time
 
 import numpy as np
 
+from agent import frames
 from agent.config_file import ConfigError
 from agent.estimation.motion import compose
 from agent.fleet_clock import FleetClock
-from agent.mavlink import MavlinkError
+from agent.mavlink_endpoint import MavlinkError
 from sim.autopilot import StandIn, StandInServer
 from sim.vehicle_telemetry import StandInSettings
 
@@ -49,18 +53,20 @@ async def _drive(settings: StandInSettings, options: argparse.Namespace) -> None
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    step_s, speed, turn = 1.0 / RATE_HZ, options.vehicle_speed, options.vehicle_speed / options.radius
-    delta = np.array([speed * step_s, 0.0, 0.0, turn * step_s])
-    pose = np.array([options.radius, 0.0, np.pi / 2.0])
+    step_s, speed = 1.0 / RATE_HZ, options.vehicle_speed
+    circle = ((speed, 0.0, 0.0), speed / options.radius)
+    pose, z = np.array([options.radius, 0.0, np.pi / 2.0]), 0.0
     try:
         while not stop.is_set():
             now_ns = clock.now_ns()
+            (forward, left, up), turn = server.stand_in.control.commanded(now_ns) or circle
+            delta = step_s * np.array([forward, left, up, turn])
             server.stand_in.set_odometry(now_ns, delta)
             x, y, heading = (float(value) for value in pose)
-            vx, vy = speed * float(np.cos(heading)), speed * float(np.sin(heading))
-            server.stand_in.set_state(now_ns, x, y, 0.0, heading, vx, vy, 0.0, turn)
+            vx, vy, vz = frames.from_level_body(np.array([forward, left, up]), heading).tolist()
+            server.stand_in.set_state(now_ns, x, y, z, heading, vx, vy, vz, turn)
             server.push(now_ns)
-            pose = compose(pose, delta[[0, 1, 3]])
+            pose, z = compose(pose, delta[[0, 1, 3]]), z + float(delta[2])
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(stop.wait(), step_s)
     finally:

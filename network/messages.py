@@ -336,7 +336,57 @@ class TeamReport:
     measurements: tuple[RawMeasurement, ...] = ()
 
 
-Body = Hello | LifeNotice | PairRequest | PairReply | SplitRequest | SplitReply | StartRequest | TeamReport
+class RoundStage(IntEnum):
+    """What a `RoundReport` tells of: before the corrections of its instant, or after them."""
+
+    PRIOR = 0
+    POSTERIOR = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """Where a target is by the sensors of one robot alone: place (d,) in ENU, d = 2 or 3.
+
+    Its error has two independent parts: `sensor` (d, d), the covariance of what stems from the sensor's noise, which is
+    new at each instant, and `pose` (d, d), of what stems from the error of the robot's own pose.
+    """
+
+    target: str
+    place: Array
+    sensor: Array
+    pose: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoundReport:
+    """What one robot tells everybody in reach once per round, at the header's `t_meas_ns` (Su 2022, table 3.1).
+
+    belief       of its own pose
+    velocity     (3,) last commanded or measured velocity [m/s], body FLU
+    yaw_rate     last commanded or measured yaw rate [rad/s]
+    targets      what it believes of targets, each with its age
+    corrections  of the stage `PRIOR`: what its sensors have told of targets since the round before
+    """
+
+    stage: RoundStage
+    belief: Belief
+    velocity: Array
+    yaw_rate: float
+    targets: tuple[TargetBelief, ...] = ()
+    corrections: tuple[Correction, ...] = ()
+
+
+Body = (
+    Hello
+    | LifeNotice
+    | PairRequest
+    | PairReply
+    | SplitRequest
+    | SplitReply
+    | StartRequest
+    | TeamReport
+    | RoundReport
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -33,6 +33,7 @@ from network.messages import (
     PairReply,
     PairRequest,
     ReplyStatus,
+    RoundReport,
     SplitReply,
     SplitRequest,
     StartRequest,
@@ -50,6 +51,7 @@ from network.wire_fields import (
     read_measurement,
     read_text,
 )
+from network.wire_round import pack_round, read_round
 from network.wire_snapshots import (
     pack_joint,
     pack_snapshot,
@@ -61,7 +63,7 @@ from network.wire_snapshots import (
 from network.wire_team import pack_report, read_report
 
 _HELLO, _PAIR_REQUEST, _PAIR_REPLY, _SPLIT_REQUEST, _SPLIT_REPLY, _TEAM_REPORT = 1, 2, 3, 4, 5, 6
-_JOINT_REQUEST, _JOINT_REPLY, _START_REQUEST, _LIFE_NOTICE = 7, 8, 9, 10
+_JOINT_REQUEST, _JOINT_REPLY, _START_REQUEST, _LIFE_NOTICE, _ROUND_REPORT = 7, 8, 9, 10, 11
 _HEADER_BYTES = 3 + 25 + 5 * 9 + 1
 """Upper bound of what surrounds a body: array marks, schema, longest source, five integers, kind."""
 
@@ -142,6 +144,8 @@ def _pack_body(body: Body) -> tuple[int, tuple[Any, ...]]:
         return _SPLIT_REPLY, (pack_epoch(body.epoch), pack_split(body.snapshot))
     if isinstance(body, TeamReport):
         return _TEAM_REPORT, pack_report(body)
+    if isinstance(body, RoundReport):
+        return _ROUND_REPORT, pack_round(body)
     if isinstance(body, StartRequest):
         return _START_REQUEST, (pack_epoch(body.epoch),)
     if isinstance(body, LifeNotice):
@@ -301,4 +305,5 @@ _BODIES: dict[int, Callable[[Any, Header], Body]] = {
     _JOINT_REPLY: _joint_reply,
     _START_REQUEST: _start_request,
     _LIFE_NOTICE: _life_notice,
+    _ROUND_REPORT: read_round,
 }

@@ -60,12 +60,12 @@ def pack_snapshot(snapshot: Snapshot) -> tuple[Any, ...]:
         pack_array(snapshot.factor, (n, columns)),
         pack_array(snapshot.line, (n, n)),
         tuple((pack_epoch(line.epoch), pack_array(line.matrix, (n, n))) for line in snapshot.lines),
-        tuple(_pack_target(target) for target in snapshot.targets),
+        tuple(pack_target(target) for target in snapshot.targets),
         snapshot.known,
     )
 
 
-def _pack_target(target: TargetBelief) -> tuple[Any, ...]:
+def pack_target(target: TargetBelief) -> tuple[Any, ...]:
     return (target.target, *pack_belief(target.belief), target.age_ns)
 
 
@@ -79,7 +79,7 @@ def pack_split(snapshot: SplitSnapshot) -> tuple[Any, ...]:
         pack_cov(snapshot.cov, n),
         None if snapshot.private is None else pack_cov(snapshot.private, n),
         snapshot.ages_ns,
-        tuple(_pack_target(target) for target in snapshot.relayed),
+        tuple(pack_target(target) for target in snapshot.relayed),
     )
 
 
@@ -112,7 +112,7 @@ def _line(raw: Any, n: int) -> Line:
     return Line(read_contact(epoch), read_array(matrix, n * n).reshape(n, n))
 
 
-def _target(raw: Any) -> TargetBelief:
+def read_target(raw: Any) -> TargetBelief:
     fields = read_fields(raw, 6)
     return TargetBelief(read_id(fields[0]), read_belief(fields[1:5]), read_integer(fields[5]))
 
@@ -126,7 +126,7 @@ def read_snapshot(raw: Any) -> Snapshot:
     lines = tuple(_line(item, n) for item in read_items(lines_raw, MAX_LINES))
     if any(later.epoch <= earlier.epoch for earlier, later in pairwise(lines)):
         raise WireError("malformed")
-    targets = tuple(_target(item) for item in read_items(targets_raw, MAX_TARGETS))
+    targets = tuple(read_target(item) for item in read_items(targets_raw, MAX_TARGETS))
     if len({target.target for target in targets}) != len(targets):
         raise WireError("malformed")
     if type(known) is not bool:
@@ -162,7 +162,7 @@ def read_split(raw: Any) -> SplitSnapshot:
     model, targets_raw, mean, cov_raw, private_raw, ages_raw, relayed_raw = read_fields(raw, 7)
     targets, n, _ = _robot_and_targets(model, targets_raw)
     ages_ns = tuple(read_integer(item) for item in read_items(ages_raw, MAX_TARGETS))
-    relayed = tuple(_target(item) for item in read_items(relayed_raw, MAX_TARGETS))
+    relayed = tuple(read_target(item) for item in read_items(relayed_raw, MAX_TARGETS))
     names = {name for name, _ in targets} | {item.target for item in relayed}
     if len(ages_ns) != len(targets) or len(names) != len(targets) + len(relayed):
         raise WireError("malformed")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from agent.config import AgentConfig
 from agent.config_file import validate
-from sim.scenario import RobotPart, Scenario, sensor_kind
+from sim.scenario import RobotPart, Scenario, sensor_kind, target_sensor
 from sim.world import World, control_odometry
 
 FLEET = "sim"
@@ -51,6 +52,8 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
         "lateness": table(scenario.lateness_of(robot)),
         "coast": table(scenario.coast),
         "health": table(scenario.health),
+        "round": table(scenario.round),
+        "planning": planning_table(scenario, world.seed, robot),
         "unsafe": table(scenario.unsafe),
         "network": table(scenario.network),
         "state": table(scenario.state),
@@ -88,6 +91,34 @@ def team_tables(scenario: Scenario, world: World, robot: RobotPart) -> list[dict
     ]
 
 
+FAR_M = 1000.0
+"""How far a planner takes a sensor without a largest range to see."""
+
+
+def planning_table(scenario: Scenario, seed: int, robot: RobotPart) -> dict[str, Any]:
+    """How a robot chooses its motion; what is not stated is as vehicle, noise, sensors, links and seed are."""
+    odometry, camera = control_odometry(robot, scenario.step_s), target_sensor(robot)
+    derived: dict[str, Any] = {
+        "max_speed_mps": robot.vehicle.max_speed_mps,
+        "max_turn_radps": robot.vehicle.max_turn_radps,
+        "speed_share": odometry.along_share,
+        "heading_rad_per_m": odometry.heading_rad_per_m,
+        "seed": seed,
+    }
+    if scenario.links.range_m is not None:
+        derived["radio_range_m"] = scenario.links.range_m
+    if camera is not None:
+        derived["sensing"] = {
+            "min_range_m": camera.min_range_m,
+            "max_range_m": camera.max_range_m or FAR_M,
+            "fov_rad": camera.fov_rad or 2.0 * math.pi,
+            "sigma_m": camera.sigma_m or 0.0,
+            "sigma_m_per_m": camera.sigma_m_per_m,
+            "sigma_rad": camera.sigma_rad,
+        }
+    return derived | table(scenario.planning_of(robot))
+
+
 def autopilot_fix(robot: RobotPart) -> str | None:
     """The sensor whose fixes come from the autopilot: a pose, or else a position; None if it has no global position."""
     kinds = {name: sensor_kind(name, sensor) for name, sensor in robot.sensors.items()}
@@ -110,8 +141,10 @@ def odometry_table(scenario: Scenario, robot: RobotPart) -> dict[str, float]:
     return {
         "along_m_per_sqrt_s": noise.along_m_per_sqrt_s,
         "along_m_per_sqrt_m": noise.along_m_per_sqrt_m,
+        "along_share": noise.along_share,
         "across_m_per_sqrt_s": noise.across_m_per_sqrt_s,
         "vertical_m_per_sqrt_s": noise.vertical_m_per_sqrt_s,
         "heading_rad_per_sqrt_s": noise.heading_rad_per_sqrt_s,
         "heading_rad_per_sqrt_rad": noise.heading_rad_per_sqrt_rad,
+        "heading_rad_per_m": noise.heading_rad_per_m,
     }

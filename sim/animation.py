@@ -39,13 +39,16 @@ def player(stored: Stored) -> str:
 <span class="clock"></span><select class="speed" aria-label="speed"></select></div>
 <div class="bar"><label><input type="checkbox" class="ellipses" checked> 3σ</label>
 <label><input type="checkbox" class="paths" checked> true paths</label>
-<label><input type="checkbox" class="links" checked> measurements and contacts</label></div>
+<label><input type="checkbox" class="links" checked> measurements and contacts</label>
+<label{"" if stored.views else " hidden"}><input type="checkbox" class="views" checked> fields of view</label></div>
 <div class="tall"><table class="now"></table></div>
 <script type="application/json">{data}</script>
 <script>{SCRIPT.read_text(encoding="utf-8")}</script></div>"""
     words = "Filled: where a robot believes to be, with its 3σ ellipse. Hollow: where it is."
     if stored.trace.targets:
         words += " Star: the target; small dots: what each robot believes of it."
+    if stored.views:
+        words += " Sectors: what a robot's sensors may see."
     words += " Thin lines: someone can be measured. Flashes: a contact is used."
     return section("The trial", body, words)
 
@@ -68,7 +71,7 @@ def film(stored: Stored) -> dict[str, Any]:
         "speeds": [item for item in SPEEDS if speed / 10.0 <= item <= speed * 10.0],
         "speed": speed,
         "robots": [
-            {"name": name, "colour": colour(index), **_frames(item, frames)}
+            {"name": name, "colour": colour(index), "views": stored.views.get(name, []), **_frames(item, frames)}
             for index, (name, item) in enumerate(trace.robots.items())
         ],
         "targets": [

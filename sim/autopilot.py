@@ -2,7 +2,8 @@
 
 The pure half (`StandIn`) turns states given by a world into frames; `StandInServer` puts it on a socket. Messages that
 describe the motion (`PUSHED`) are sent exactly once per world state, stamped with its instant, when they have been
-asked for; all others at their interval in fleet time. Nothing here obeys flight commands.
+asked for; all others at their interval in fleet time. It is armed, changes its mode and obeys velocity set-points as
+`sim.vehicle_control` says; other flight commands are not supported.
 
 `ardupilot` streams nothing unasked but HEARTBEAT and TIMESYNC; `px4` streams its onboard set.
 """
@@ -16,7 +17,9 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from agent.fleet_clock import FleetClock
-from agent.mavlink import Endpoint, MavlinkEndpointError, Timer, UdpLine, parse_endpoint
+from agent.mavlink import Timer, UdpLine
+from agent.mavlink_endpoint import Endpoint, MavlinkEndpointError, parse_endpoint
+from sim.vehicle_control import COMMANDS
 from sim.vehicle_telemetry import StandInSettings, Telemetry
 
 NS = 1_000_000_000
@@ -125,6 +128,11 @@ class StandIn(Telemetry):
                     self.counters["bad_data"] += 1
                 case "COMMAND_LONG" | "COMMAND_INT":
                     out += self._command(now_ns, message)
+                case "SET_MODE":
+                    out += self._set_mode(now_ns, message)
+                case "SET_POSITION_TARGET_LOCAL_NED":
+                    if self._is_meant(message):
+                        self.control.setpoint(now_ns, message)
                 case "TIMESYNC":
                     out += self._timesync(now_ns, message)
                 case "HEARTBEAT":
@@ -140,12 +148,35 @@ class StandIn(Telemetry):
             self.companion_offset_ns = message.tc1 - (message.ts1 + boot) // 2
         return []
 
+    def _is_meant(self, message: Any) -> bool:
+        """Whether a message is for this vehicle; SET_MODE names no component."""
+        component = 0 if message.get_type() == "SET_MODE" else message.target_component
+        own = (0, dialect.MAV_COMP_ID_AUTOPILOT1)
+        if message.target_system in (0, self.settings.system_id) and component in own:
+            return True
+        self.counters["other_target"] += 1
+        return False
+
+    def _set_mode(self, now_ns: int, message: Any) -> list[bytes]:
+        """The old way to change the mode; ArduPilot acknowledges it, PX4 does not."""
+        if not self._is_meant(message):
+            return []
+        result, reason = self.control.change_mode(now_ns, message.base_mode, message.custom_mode)
+        if self.settings.flavour == "px4":
+            return self._said(reason)
+        return [self._ack(dialect.MAVLINK_MSG_ID_SET_MODE, result, message), *self._said(reason)]
+
+    def _said(self, reason: str | None) -> list[bytes]:
+        if reason is None:
+            return []
+        return [self._encode(dialect.MAVLink_statustext_message(dialect.MAV_SEVERITY_CRITICAL, reason.encode()))]
+
+    def _ack(self, command: int, result: int, message: Any) -> bytes:
+        source = (message.get_srcSystem(), message.get_srcComponent())
+        return self._encode(dialect.MAVLink_command_ack_message(command, result, 0, 0, *source))
+
     def _command(self, now_ns: int, message: Any) -> list[bytes]:
-        if message.target_system not in (0, self.settings.system_id) or message.target_component not in (
-            0,
-            dialect.MAV_COMP_ID_AUTOPILOT1,
-        ):
-            self.counters["other_target"] += 1
+        if not self._is_meant(message):
             return []
         result, answers = dialect.MAV_RESULT_UNSUPPORTED, []
         if message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
@@ -158,12 +189,12 @@ class StandIn(Telemetry):
             if found is not None:
                 answers = [self._encode(found)]
             result = dialect.MAV_RESULT_DENIED if found is None else dialect.MAV_RESULT_ACCEPTED
+        elif message.command in COMMANDS:
+            result, reason = self.control.command(now_ns, message)
+            answers = self._said(reason)
         else:
             self.counters["unsupported_command"] += 1
-        ack = dialect.MAVLink_command_ack_message(
-            message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()
-        )
-        return [self._encode(ack), *answers]
+        return [self._ack(message.command, result, message), *answers]
 
     def _set_interval(self, now_ns: int, message_id: float, interval_us: float) -> int:
         name = _name(message_id)

@@ -88,7 +88,7 @@ class _Joint:
             robots,
             targets,
             world.landmarks,
-            transform=scenario.localization.transform,
+            transform=scenario.localization.transform or "unscented",
             innovation_cap=scenario.localization.innovation_cap or 0.0,
             unseen=unseen,
             within_m=scenario.tracking.start_within_m,

@@ -10,7 +10,7 @@ import heapq
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ from sim.faulty_world import FaultyWorld
 from sim.invariants import InvariantChecker
 from sim.lives import LifeSink, Process
 from sim.metrics import TrialTrace
+from sim.motion_figures import trial_motion
 from sim.reach import Reach
 from sim.sampling import MeasurementLog, Sampler
 from sim.scenario import Scenario
@@ -69,7 +70,10 @@ class TrialResult:
     rejected: dict[str, int]
     nis: dict[str, dict[str, tuple[float, int]]]
     counters: dict[str, dict[str, int]]
+    motion: dict[str, float | None]
     step_us: list[float] = field(default_factory=list)
+    plan_us: list[float] = field(default_factory=list)
+    """Time of each event that ended in a command to a vehicle."""
     measured: dict[tuple[str, str], Array] = field(default_factory=dict)
     """Instants [s] at which a robot measured somebody, by (robot, of)."""
 
@@ -121,6 +125,7 @@ class VirtualEngine:
         self._bases: dict[tuple[str, str], Epoch] = {}
         self._traffic: Counter[str] = Counter()
         self.step_us: list[float] = []
+        self.plan_us: list[float] = []
         for name, fault in trial_faults(scenario, seed).items():
             self.inject(name, fault)
 
@@ -149,6 +154,9 @@ class VirtualEngine:
             return False
         self._k += 1
         started = time.perf_counter()
+        if self._world.closed_loop:
+            # What is told to vehicles before an instant decides where they are then.
+            self._pass(self._k * self._world.step_ns - 1)
         outputs = self._world.outputs(self._k)
         self._measured.add(outputs)
         for item in outputs:
@@ -184,10 +192,15 @@ class VirtualEngine:
     def _play(self, k: int) -> None:
         """Everything up to and including instant k. Who hears whom follows the positions at each instant."""
         end = k * self._world.step_ns
+        self._pass(end - 1)
+        self._publish_range(k)
+        self._now = end
+        self._pass(end)
+
+    def _pass(self, end: int) -> None:
+        """Everything that happens until `end`, and then."""
         while self._heap and self._heap[0][0] <= end:
             t_ns, phase, _, _, robot, what = heapq.heappop(self._heap)
-            if t_ns == end and self._now < end:
-                self._publish_range(k)
             self._now = t_ns
             process = self._processes[robot]
             if phase == FAULT:
@@ -200,11 +213,8 @@ class VirtualEngine:
                 del self._timers[robot]
                 self._ticked[robot] = t_ns
                 if process.node is not None and process.runs:
-                    self._carry_out(process.node, "a timer", process.node.on_tick(process.clock.local_ns(t_ns)))
+                    self._handled(process, "a timer", process.node.on_tick, process.clock.local_ns(t_ns))
             self._note_contacts(process)
-        if self._now < end:
-            self._publish_range(k)
-            self._now = end
 
     def _sensed(self, process: Process, item: Output) -> None:
         """A datum reaches its robot, stamped by the robot's clock."""
@@ -223,14 +233,14 @@ class VirtualEngine:
             attitude=item.attitude,
         )
         what = f"{item.kind} of {item.of or 'itself'} by {item.sensor}"
-        self._carry_out(process.node, what, process.node.on_sensor(local_ns(self._now), payload))
+        self._handled(process, what, process.node.on_sensor, local_ns(self._now), payload)
 
     def _arrived(self, process: Process, packet: Packet) -> None:
         if process.node is None or not process.runs:
             process.keep_packet(packet)
             return
         what = f"a packet of {packet.source} on {packet.channel}"
-        self._carry_out(process.node, what, process.node.on_packet(process.clock.local_ns(self._now), packet))
+        self._handled(process, what, process.node.on_packet, process.clock.local_ns(self._now), packet)
 
     def _happen(self, process: Process, what: Happening) -> None:
         """A fault of a process or clock, or a forged packet."""
@@ -272,6 +282,18 @@ class VirtualEngine:
             if epoch != self._bases.get((robot, peer)):
                 self._bases[robot, peer] = epoch
                 self.contacts.append((self._now / NS, robot, peer))
+
+    def _handled(self, process: Process, event: str, handle: Callable[..., Outgoing], *what: Any) -> None:
+        """An event reaches a robot that is up, and what it makes of it is carried out."""
+        assert process.node is not None
+        started = time.perf_counter()
+        out = handle(*what)
+        if out.steer is not None:
+            self.plan_us.append((time.perf_counter() - started) * 1e6)
+            # Its own clock is the vehicle's: one that stops sending commands stops when the last one ends.
+            until_ns = process.clock.true_ns(out.steer.until_ns, self._now)
+            self._world.steer(process.robot, self._now, replace(out.steer, until_ns=until_ns))
+        self._carry_out(process.node, event, out)
 
     def _carry_out(self, node: Node, event: str, out: Outgoing) -> None:
         """What a robot makes of an event."""
@@ -345,6 +367,7 @@ class VirtualEngine:
         for process in self._processes.values():
             refused.update(process.rejected())
         counters = {name: process.counters() for name, process in self._processes.items()}
+        measured = self._measured.instants()
         return TrialResult(
             self._sampler.trace(),
             self.contacts,
@@ -352,6 +375,8 @@ class VirtualEngine:
             dict(sorted(refused.items())),
             {name: process.nis() for name, process in self._processes.items()},
             counters,
+            trial_motion(self._scenario, self._world, measured, self._k),
             self.step_us,
-            self._measured.instants(),
+            self.plan_us,
+            measured,
         )

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.effects import Steer
 from agent.estimation.observation import RELATIVE_ANGLES
 from agent.fault_parts import AnySensorFaultPart, BiasPart, DropoutPart, OutliersPart, SensorDelayPart, SilencePart
 from agent.settings import nanoseconds
@@ -32,12 +33,13 @@ class FaultyWorld:
         from_autopilot: dict[str, str | None],
         drop_silenced: bool = True,
     ) -> None:
-        self._world, self._seed = world, seed
+        self._world, self.seed = world, seed
         self._faults: list[tuple[str, AnySensorFaultPart, tuple[int, int]]] = []
         self._from_autopilot = from_autopilot
         self._drop_silenced = drop_silenced
         self.robots, self.targets, self.landmarks = world.robots, world.targets, world.landmarks
         self.steps, self.step_ns = world.steps, world.step_ns
+        self.closed_loop = world.closed_loop
 
     def add(self, name: str, fault: AnySensorFaultPart) -> None:
         """One more fault, with its times from the start of the run."""
@@ -59,6 +61,9 @@ class FaultyWorld:
 
     def place(self, entity: str, k: int) -> Array:
         return self._world.place(entity, k)
+
+    def steer(self, robot: str, t_ns: int, steer: Steer) -> None:
+        self._world.steer(robot, t_ns, steer)
 
     def outputs(self, k: int) -> list[Output]:
         """What is left of the data, faults applied in the order they are stated."""
@@ -104,7 +109,7 @@ class FaultyWorld:
             z = item.z.copy()
             z[0] += fault.bias
             return replace(item, z=_possible(item.kind, z))
-        draw = generator(self._seed, name, item.robot, item.sensor, item.of or "", str(item.t_ns))
+        draw = generator(self.seed, name, item.robot, item.sensor, item.of or "", str(item.t_ns))
         if isinstance(fault, SensorDelayPart):
             tail_ns = exponential_ns(nanoseconds(fault.tail_s), draw.random())
             return replace(item, late_ns=item.late_ns + nanoseconds(fault.delay_s) + tail_ns)

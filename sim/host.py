@@ -15,12 +15,11 @@ import signal
 import socket
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from agent.clock_faults import FaultyClock
 from agent.control import ControlLine
@@ -32,16 +31,16 @@ from agent.settings import nanoseconds
 from network.link_feed import LinkFeed
 from sim.agents import autopilot_fix
 from sim.autopilot import StandIn, StandInServer
+from sim.closed_loop import MotionWriter
 from sim.fault_plan import trial_faults
 from sim.faulty_world import FaultyWorld
 from sim.reach import Reach
 from sim.scenario import RobotPart
 from sim.scenario_file import load
 from sim.trial import open_world
-from sim.vehicle_telemetry import StandInSettings
-from sim.world import Output
+from sim.vehicle_telemetry import VEHICLES, StandInSettings
+from sim.world import Output, SimulatedWorld
 
-VEHICLES = {False: dialect.MAV_TYPE_GROUND_ROVER, True: dialect.MAV_TYPE_QUADROTOR}
 BOOT_LEAD_NS = 30_000_000_000
 FINAL_WALL_S = 0.5
 CLONE_NEWNET = 0x40000000
@@ -58,6 +57,8 @@ class HostPlan:
     link_endpoint: str
     mavlink_ports: dict[str, int]
     sensor_sockets: dict[str, str]
+    motion: str
+    """The file for the motion of robots that choose it: nobody else can tell it afterwards."""
     namespaces: dict[str, str] = field(default_factory=dict)
     """Network namespaces of robots that have one of their own: their stand-ins speak there."""
 
@@ -99,7 +100,12 @@ class WorldHost:
         self._scenario = load(plan.scenario)
         self._fixes = {robot.id: autopilot_fix(robot) for robot in self._scenario.robots}
         # A silent autopilot goes on moving: it is the stand-in that says nothing.
-        self._world = FaultyWorld(open_world(self._scenario, plan.seed), plan.seed, self._fixes, drop_silenced=False)
+        world = open_world(self._scenario, plan.seed)
+        self._world = FaultyWorld(world, plan.seed, self._fixes, drop_silenced=False)
+        self._motion: MotionWriter | None = None
+        if isinstance(world, SimulatedWorld) and world.closed_loop:
+            self._motion = MotionWriter(Path(plan.motion), world.motion)
+            self._motion.add(0)
         self._clocks: dict[str, FaultyClock] = {robot.id: FaultyClock() for robot in self._scenario.robots}
         links = self._scenario.links
         self._reach = None if links.range_m is None else Reach(self._world, links.range_m, links.hysteresis_m)
@@ -144,6 +150,8 @@ class WorldHost:
             for server in self._servers.values():
                 await server.close()
             self._socket.close()
+            if self._motion is not None:
+                self._motion.close()
             await control.close()
             with contextlib.suppress(TimeoutError):
                 await self._feed.close()
@@ -182,6 +190,8 @@ class WorldHost:
                 boot_ns=clock.t0_ns - BOOT_LEAD_NS,
                 vehicle_type=VEHICLES[LAYOUTS[part.model].altitude is not None],
                 own_fixes=self._fixes[robot] is not None,
+                armed=part.autopilot.armed,
+                mode=part.autopilot.mode,
             )
             server = StandInServer(StandIn(settings), f"udpout:127.0.0.1:{port}", clock)
             with inside(self._plan.namespaces.get(robot)):
@@ -200,18 +210,35 @@ class WorldHost:
         groups: dict[int, list[Output]] = {}
         for k in range(1, world.steps + 1):
             end = k * world.step_ns
+            if self._motion is not None:
+                # Vehicles are where they have been told to go until now.
+                await self._emit_until(k, clock, groups, end - 1)
+                await self._until(clock, clock.t0_ns + end)
+                self._steer(clock.t0_ns, end)
             for item in world.outputs(k):
                 groups.setdefault(item.t_ns + item.late_ns, []).append(item)
-            for t_ns in sorted(t_ns for t_ns in groups if t_ns <= end):
-                items = groups.pop(t_ns)
-                await self._until(clock, clock.t0_ns + t_ns)
-                if t_ns == end:
-                    self._publish_reach(k, clock.t0_ns + end)
-                self._emit(k, clock.t0_ns, items)
+            if self._motion is not None:
+                self._motion.add(k)
+            await self._emit_until(k, clock, groups, end)
             if k % 10 == 0:
                 control.say({"status": {"progress": k / world.steps}})
         # The last instant settles and its exchanges end before the agents are stopped.
         await asyncio.sleep(FINAL_WALL_S + clock.wall_s(2 * world.step_ns) / 2)
+
+    async def _emit_until(self, k: int, clock: FleetClock, groups: dict[int, list[Output]], end: int) -> None:
+        """What reaches robots until `end`, each datum in its time."""
+        for t_ns in sorted(t_ns for t_ns in groups if t_ns <= end):
+            items = groups.pop(t_ns)
+            await self._until(clock, clock.t0_ns + t_ns)
+            if t_ns == k * self._world.step_ns:
+                self._publish_reach(k, clock.t0_ns + t_ns)
+            self._emit(k, clock.t0_ns, items)
+
+    def _steer(self, t0_ns: int, end: int) -> None:
+        """What the autopilots were told until `end`, from the arrival of each command on."""
+        for robot in self._scenario.planners():
+            for t_ns, steer in self._servers[robot.id].stand_in.control.commands(t0_ns + end):
+                self._world.steer(robot.id, t_ns - t0_ns, replace(steer, until_ns=steer.until_ns - t0_ns))
 
     async def _until(self, clock: FleetClock, t_ns: int) -> None:
         wait_s = clock.wall_s(t_ns - clock.now_ns())

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from agent.auto_filter import AutoFilter
 from agent.effects import Estimate
 from agent.estimation.gaussian import is_positive_definite
+from agent.estimation.motion import UNICYCLE_GAINS
 from agent.factor_filter import FactorFilter
 from agent.node import Node, Outgoing
 from agent.replica_filter import ReplicaFilter
@@ -140,7 +141,8 @@ def _unlearnt(life: _Life, estimate: Estimate) -> Iterable[tuple[str, str]]:
     heading = agent.settings.layout.heading
     if heading is None:
         return
-    pose = [0, 1, heading]
+    # A pose may become surer by the gains of its odometry that it is correlated with, never both together.
+    pose = list(range(len(estimate.mean))) if estimate.model == UNICYCLE_GAINS.name else [0, 1, heading]
     volume = float(np.linalg.slogdet(estimate.cov[np.ix_(pose, pose)])[1])
     form = (agent.filter, agent.filter.form()[0])
     if learnt == life.learnt and form == life.form and volume < life.volume - 1e-6:

@@ -82,7 +82,8 @@ def _one(scenario: Scenario, task: Task, check: bool) -> Finished:
     except Exception as error:
         return Finished(seed, time.perf_counter() - started, error=_told(error))
     # One figure per trial is enough for the summary; thousands of steps would only be carried about.
-    reduced["step_us"] = [statistics.median(reduced["step_us"])] if reduced["step_us"] else []
+    for key in ("step_us", "plan_us"):
+        reduced[key] = [statistics.median(reduced[key])] if reduced[key] else []
     return Finished(seed, time.perf_counter() - started, reduced)
 
 
@@ -198,7 +199,7 @@ def run_trials(
 
 
 def write_trials(path: Path, first: int, rows: dict[int, dict[str, Any]]) -> None:
-    """`trials.csv`: the fleet figures of each trial, by the seed that replays it; the first trial has seed `first`."""
+    """`trials.csv`: the figures of each trial, by the seed that replays it; the first trial has seed `first`."""
     columns = ["trial", "seed", *(sorted(next(iter(rows.values()))) if rows else [])]
     with path.open("w", newline="") as file:
         writer = csv.writer(file)

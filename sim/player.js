@@ -19,7 +19,7 @@
     });
   };
   const open = (item) => Object.fromEntries(Object.entries(item.channels).map(([name, data]) => [name, unpack(data)]));
-  const robots = film.robots.map((item) => ({ name: item.name, colour: item.colour, ...open(item) }));
+  const robots = film.robots.map((item) => ({ name: item.name, colour: item.colour, views: item.views, ...open(item) }));
   const targets = film.targets.map((item) => ({
     name: item.name,
     tracks: item.tracks.map((track) => ({ colour: robots[track.robot].colour, robot: track.robot, ...open(track) })),
@@ -139,6 +139,25 @@
     pen.globalAlpha = 1;
   };
 
+  const views = (item) => {  // from where the robot is, not from where it believes to be
+    const heading = item.H ? turned(item.H, 2 * Math.PI) : NaN;
+    if (Number.isNaN(heading) || Number.isNaN(at(item.X))) return;
+    const far = 0.2 * Math.max(box.x1 - box.x0, box.y1 - box.y0);
+    for (const [x, y, yaw, fov, least, most] of item.views) {
+      const cx = px(at(item.X) + x * Math.cos(heading) - y * Math.sin(heading));
+      const cy = py(at(item.Y) + x * Math.sin(heading) + y * Math.cos(heading));
+      const left = -(heading + yaw + 0.5 * fov), right = -(heading + yaw - 0.5 * fov);
+      pen.beginPath();
+      pen.arc(cx, cy, (most ?? Math.max(far, 2 * least)) * scale, left, right);
+      pen.arc(cx, cy, least * scale, right, left, true);
+      pen.closePath();
+      pen.fillStyle = item.colour; pen.strokeStyle = item.colour; pen.lineWidth = 0.8;
+      pen.globalAlpha = 0.09; pen.fill();
+      pen.globalAlpha = 0.4; pen.stroke();
+      pen.globalAlpha = 1;
+    }
+  };
+
   const place = (name) => {
     if (name in index) { const item = robots[index[name]]; return [at(item.X), at(item.Y)]; }
     const [kind, rest] = [name.slice(0, name.indexOf(":")), name.slice(name.indexOf(":") + 1)];
@@ -200,6 +219,7 @@
     const tail = Math.max(0, k - Math.ceil(frames / 16));
     pen.lineWidth = 1.6;
     for (const item of robots) { pen.strokeStyle = item.colour; pen.globalAlpha = 0.55; path(item.x, item.y, tail, k); pen.globalAlpha = 1; }
+    if (find(".views").checked) robots.forEach(views);
     if (find(".links").checked) links(t);
     const shown = find(".ellipses").checked;
     for (const target of targets) {
@@ -284,6 +304,6 @@
     now = start + (end - start) * Number(slider.value) / 1000;
     show();
   });
-  for (const name of [".ellipses", ".paths", ".links"]) find(name).addEventListener("change", show);
+  for (const name of [".ellipses", ".paths", ".links", ".views"]) find(name).addEventListener("change", show);
   new ResizeObserver(() => requestAnimationFrame(() => { resize(); show(); })).observe(canvas.parentElement);
 })();

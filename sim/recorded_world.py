@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from agent.calibration import Calibration, corrected
 from agent.config_file import ConfigError
+from agent.effects import Steer
 from agent.estimation.gaussian import wrap_components
 from agent.estimation.motion import LAYOUTS
 from agent.estimation.observation import ABSOLUTE, RELATIVE_ANGLES
@@ -50,7 +51,8 @@ class RecordedWorld:
         path = scenario.world.path
         assert path is not None
         self._recording = _read(scenario.world.format, path, _stamp_ns(path))
-        self._scenario, self._seed = scenario, seed
+        self._scenario, self.seed = scenario, seed
+        self.closed_loop = False
         self.robots = tuple(robot.id for robot in scenario.robots)
         self.targets = tuple(target.id for target in scenario.targets)
         self.landmarks: dict[str, tuple[float, ...]] = dict(self._recording.landmarks.items())
@@ -106,7 +108,7 @@ class RecordedWorld:
         cov = part.start_sigma.covariance(part.model)
         if self._known(entity):
             truth = self.truth(entity, 0)
-            return drawn_belief(truth, cov, self._seed, entity, LAYOUTS[part.model].angles)
+            return drawn_belief(truth, cov, self.seed, entity, LAYOUTS[part.model].angles)
         assert part.start.pose is not None
         return np.append(part.start.pose, np.ones(len(cov) - len(part.start.pose))), cov
 
@@ -123,6 +125,9 @@ class RecordedWorld:
     def place(self, entity: str, k: int) -> Array:
         return np.append(self.truth(entity, k)[:2], 0.0)
 
+    def steer(self, robot: str, t_ns: int, steer: Steer) -> None:
+        raise ValueError(f"{robot} cannot be steered: it has moved as it was recorded")
+
     def outputs(self, k: int) -> list[Output]:
         found: list[Output] = []
         for robot in self._scenario.robots:
@@ -135,7 +140,7 @@ class RecordedWorld:
     def _drawn(self, robot: str, name: str, size: int, k: int) -> Array:
         """Standard normal numbers (size,) of a robot's sensor for instant k."""
         if (robot, name) not in self._noise:
-            self._noise[robot, name] = normal_rows(self._seed, self.steps + 1, size, robot, name)
+            self._noise[robot, name] = normal_rows(self.seed, self.steps + 1, size, robot, name)
         return np.asarray(self._noise[robot, name][k])
 
     def _odometry(self, robot: RobotPart, k: int) -> Output:

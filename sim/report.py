@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sim import availability, error_plots, plots, series_plots, tables
 from sim.animation import player
 from sim.page import cards, number, page, picture, section, size, verdict
@@ -41,6 +43,7 @@ def _pictures(folder: Path, summary: dict[str, Any], stored: Stored | None) -> P
         _over_trials(summary, add)
     if stored is not None:
         _of_one_trial(stored, (summary["window_s"][0], summary["window_s"][1]), add)
+        _of_motion(stored, summary.get("motion", {}), add)
     return found
 
 
@@ -111,6 +114,19 @@ def _of_one_trial(stored: Stored, window: tuple[float, float], add: Add) -> None
         )
 
 
+def _of_motion(stored: Stored, motion: dict[str, Any], add: Add) -> None:
+    if motion.get("min_distance_m") is None:
+        return
+    limit_m, states = motion["collision_m"], list(stored.trace.robots.values())
+    places = np.stack([item.truth[:, list(item.position[:2])] for item in states], axis=1)
+    add(
+        "distances",
+        "How far robots were from each other",
+        f"True distances of all pairs on the ground; below {limit_m:g} m it is a collision.",
+        lambda path: series_plots.pair_distances(stored.trace.t_s, places, limit_m, path),
+    )
+
+
 def _shown(count: int) -> str:
     return f" The {plots.MAX_PANELS} with the largest errors of {count}." if count > plots.MAX_PANELS else ""
 
@@ -134,6 +150,7 @@ def _page(run_dir: Path, summary: dict[str, Any], stored: Stored | None, picture
     if summary["targets"]:
         blocks.append(section("Targets", tables.targets(summary)))
     blocks.append(tables.extremes(summary))
+    blocks.append(tables.motion(summary))
     blocks += [picture(*item) for name, item in pictures.items() if name not in first]
     blocks.append(tables.innovations(summary))
     blocks.append(

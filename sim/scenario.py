@@ -22,8 +22,6 @@ from agent.config_file import (
 from agent.config_parts import (
     CalibrationPart,
     CoastPart,
-    ControlNoisePart,
-    ControlPart,
     HealthPart,
     IntrinsicsPart,
     LandmarkPart,
@@ -33,7 +31,6 @@ from agent.config_parts import (
     MotionPart,
     MountVector,
     NetworkPart,
-    OdometryPart,
     RobotModel,
     SensorKind,
     SigmaPart,
@@ -42,6 +39,8 @@ from agent.config_parts import (
 from agent.estimation.motion import TargetMotion
 from agent.estimation.mounting import mount_of
 from agent.fault_parts import FaultPart
+from agent.motion_parts import ControlNoisePart, ControlPart, OdometryPart
+from agent.planning_parts import PLAIN, PlanningPart, RoundPart
 from agent.sensor_input import SensorConfig
 from agent.settings import nanoseconds
 from agent.start_config import StartSource
@@ -136,11 +135,28 @@ class SensorPart(Part):
     form: Form = "polar"
 
 
+class VehiclePart(Part):
+    """What the vehicle of a robot with planning can do, whatever it is told.
+
+    `min_speed_mps` below 0: it drives backwards too; above 0: it cannot stand still. Without `max_acceleration_mps2`
+    its speed changes at once.
+    """
+
+    max_speed_mps: Positive = PLAIN.max_speed_mps
+    max_turn_radps: Positive = PLAIN.max_turn_radps
+    max_acceleration_mps2: Positive | None = None
+    min_speed_mps: Finite = 0.0
+
+
 class AutopilotPart(Part):
-    """What the vehicle's autopilot sends. A GPS-denied one sends odometry in a drifting local frame only."""
+    """What the vehicle's autopilot sends: a GPS-denied one odometry in a drifting local frame only. How it is found at
+    the start: `mode` is a flight mode of its flavour, `GUIDED` for instance; absent: one that a person drives in.
+    """
 
     sends: list[Literal["odometry", "global_position", "attitude"]] = ["odometry", "attitude"]
     flavour: Literal["ardupilot", "px4"] = "ardupilot"
+    armed: bool = False
+    mode: str | None = None
 
 
 class RobotPart(Part):
@@ -159,12 +175,14 @@ class RobotPart(Part):
     control: ControlPart = ControlPart()
     noise: ControlNoisePart = ControlNoisePart()
     odometry: OdometryPart | None = None
+    vehicle: VehiclePart = VehiclePart()
     tilt_rad: NotNegative = 0.0
     sensors: dict[str, SensorPart] = {}
     autopilot: AutopilotPart = AutopilotPart()
     localization: dict[str, Any] = {}
     tracking: dict[str, Any] = {}
     lateness: dict[str, Any] = {}
+    planning: dict[str, Any] = {}
 
     def motion(self) -> MotionPart:
         """How an estimator takes the robot to move."""
@@ -238,6 +256,7 @@ class Scenario(Part):
     step_s: Positive
     window_s: Vector2
     lost_above_m: Positive = 8.0
+    collision_m: Positive = 2.0
     origin: Vector3 = [47.397742, 8.545594, 488.0]
     world: WorldPart = WorldPart()
     localization: LocalizationPart = LocalizationPart()
@@ -245,6 +264,8 @@ class Scenario(Part):
     lateness: LatenessPart = LatenessPart()
     coast: CoastPart = CoastPart()
     health: HealthPart = HealthPart()
+    round: RoundPart = RoundPart()
+    planning: PlanningPart = PlanningPart()
     unsafe: UnsafePart = UnsafePart()
     network: NetworkPart = NetworkPart()
     state: StatePart = StatePart()
@@ -271,6 +292,13 @@ class Scenario(Part):
     def tracking_of(self, robot: RobotPart) -> TrackingPart:
         return self._overridden(TrackingPart, self.tracking, robot, "tracking")
 
+    def planning_of(self, robot: RobotPart) -> PlanningPart:
+        return self._overridden(PlanningPart, self.planning, robot, "planning")
+
+    def planners(self) -> list[RobotPart]:
+        """The robots that choose their motion."""
+        return [robot for robot in self.robots if self.planning_of(robot).kind != "none"]
+
     def _overridden(self, model: type[P], base: P, robot: RobotPart, name: str) -> P:
         own: dict[str, Any] = getattr(robot, name)
         if not own:
@@ -288,6 +316,14 @@ KINDS: tuple[str, ...] = get_args(SensorKind)
 def sensor_kind(name: str, sensor: SensorPart) -> str:
     """The kind of a sensor: stated, or its name."""
     return sensor.kind if sensor.kind is not None else name
+
+
+def target_sensor(robot: RobotPart) -> SensorPart | None:
+    """The sensor a planner reckons with: the first of kind `range_bearing` that sees targets."""
+    for name, sensor in robot.sensors.items():
+        if sensor_kind(name, sensor) == "range_bearing" and "targets" in sensor.of:
+            return sensor
+    return None
 
 
 def sensor_config(sensor: SensorPart) -> SensorConfig:

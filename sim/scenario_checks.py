@@ -5,16 +5,15 @@ from __future__ import annotations
 from agent.config_file import (
     ConfigError,
 )
-from agent.config_parts import (
-    MAX_TEAM,
-    ControlPart,
-)
+from agent.config_parts import MAX_TEAM
 from agent.estimation.motion import LAYOUTS
 from agent.estimation.observation import RELATIVE_ANGLES
 from agent.fault_parts import AnyFaultPart, SensorDelayPart, SensorFaultPart, check_faults, named
 from agent.joint_room import check_room
+from agent.motion_parts import ControlPart
 from agent.start_config import check_start
-from sim.scenario import KINDS, MIN_STEP_S, RobotPart, Scenario, SensorPart, TargetPart, sensor_kind
+from sim.scenario import KINDS, MIN_STEP_S, RobotPart, Scenario, SensorPart, TargetPart, sensor_kind, target_sensor
+from sim.vehicle_telemetry import VEHICLES, StandInSettings
 
 
 def check(scenario: Scenario) -> None:
@@ -52,10 +51,12 @@ def check(scenario: Scenario) -> None:
             f"there are: {', '.join(circling)}"
         )
     _check_steering(scenario)
+    _check_planning(scenario)
     _check_team(scenario)
     check_schedule(scenario, scenario.faults)
     for robot in scenario.robots:
         _check_mover(f"{scenario.name}: robots.{robot.id}", robot)
+        _check_autopilot(f"{scenario.name}: robots.{robot.id}", robot)
         if recorded and LAYOUTS[robot.model].altitude is not None:
             raise ConfigError(
                 f"{scenario.name}: robots.{robot.id}.model = '{robot.model}' has an altitude, and recordings are "
@@ -103,6 +104,14 @@ def check(scenario: Scenario) -> None:
             raise ConfigError(f"{scenario.name}: targets.{target.id}.start.pose is missing")
 
 
+def _check_autopilot(where: str, robot: RobotPart) -> None:
+    vehicle_type = VEHICLES[LAYOUTS[robot.model].altitude is not None]
+    try:
+        StandInSettings(flavour=robot.autopilot.flavour, vehicle_type=vehicle_type, mode=robot.autopilot.mode)
+    except ValueError as error:
+        raise ConfigError(f"{where}.autopilot.{error}") from None
+
+
 def check_schedule(scenario: Scenario, faults: list[AnyFaultPart]) -> None:
     """Faults are of robots and sensors that are there, and begin before the end. Raises `ConfigError`."""
     robots = {robot.id: robot for robot in scenario.robots}
@@ -123,21 +132,68 @@ def check_schedule(scenario: Scenario, faults: list[AnyFaultPart]) -> None:
 
 
 def _check_team(scenario: Scenario) -> None:
-    """Either all robots tell each other raw data or none, and they are few."""
+    """All robots of a fleet tell each other raw data, or rounds, or neither; who tell raw data are few."""
     kinds = {robot.id: scenario.localization_of(robot).kind for robot in scenario.robots}
-    if "replica" not in kinds.values():
-        return
-    other = next((name for name, kind in kinds.items() if kind != "replica"), None)
-    if other is not None:
-        raise ConfigError(
-            f"{scenario.name}: robots.{other}.localization.kind = '{kinds[other]}' beside 'replica': who does not tell "
-            "its raw data is nowhere in the belief of the others; give all robots one kind"
-        )
-    if len(kinds) > MAX_TEAM + 1:
+    for kind, why in UNMIXED.items():
+        other = next((name for name, own in kinds.items() if own != kind), None)
+        if kind in kinds.values() and other is not None:
+            raise ConfigError(
+                f"{scenario.name}: robots.{other}.localization.kind = '{kinds[other]}' beside '{kind}': {why}; "
+                "give all robots one kind"
+            )
+    if "replica" in kinds.values() and len(kinds) > MAX_TEAM + 1:
         raise ConfigError(
             f"{scenario.name}: localization.kind = 'replica' takes {MAX_TEAM + 1} robots at most, there are "
             f"{len(kinds)}; take 'clat'"
         )
+
+
+UNMIXED = {
+    "replica": "who does not tell its raw data is nowhere in the belief of the others",
+    "jlatt": "who takes no part in rounds is not heard by those who do",
+}
+"""Kinds that all robots of a fleet have, or none, and why."""
+
+
+def _check_planning(scenario: Scenario) -> None:
+    """Robots that choose their motion do so in a simulated world, and are not driven by anything else."""
+    source = ""
+    try:
+        scenario.round.settings()
+        for robot in scenario.robots:
+            planning, source = scenario.planning_of(robot), ""
+            if planning.radio_range_m is None and scenario.links.range_m is not None:
+                planning = planning.model_copy(update={"radio_range_m": scenario.links.range_m})
+                source = "; planning.radio_range_m is not stated, which is links.range_m then"
+            planning.settings()
+    except ConfigError as error:
+        raise ConfigError(f"{scenario.name}: {error}{source}") from None
+    for robot in scenario.robots:
+        vehicle, where = robot.vehicle, f"{scenario.name}: robots.{robot.id}"
+        if vehicle.min_speed_mps > vehicle.max_speed_mps:
+            raise ConfigError(
+                f"{where}.vehicle.min_speed_mps = {vehicle.min_speed_mps:g} is above max_speed_mps = "
+                f"{vehicle.max_speed_mps:g}; lower it"
+            )
+    for robot in scenario.planners():
+        where, kind = f"{scenario.name}: robots.{robot.id}", scenario.planning_of(robot).kind
+        if scenario.world.kind == "recording":
+            raise ConfigError(
+                f"{where}: planning.kind = '{kind}' does not go with a recording, whose robots have moved already; "
+                "take planning.kind = 'none'"
+            )
+        if scenario.world.steering is not None:
+            raise ConfigError(
+                f"{where}: planning.kind = '{kind}' does not go with world.steering, which steers all robots on their "
+                "true places; leave one of them out"
+            )
+        if robot.control.speed_mps or robot.control.yaw_rate_radps:
+            raise ConfigError(f"{where}.control is not used with planning.kind = '{kind}'; leave it out")
+        if kind == "optimal" and scenario.planning_of(robot).sensing is None and target_sensor(robot) is None:
+            raise ConfigError(
+                f"{where}: planning.kind = 'optimal' predicts what is seen, and no sensor of kind 'range_bearing' "
+                "sees targets; add one, or state planning.sensing"
+            )
 
 
 def _check_steering(scenario: Scenario) -> None:
@@ -178,7 +234,8 @@ def check_sensor(where: str, name: str, sensor: SensorPart) -> None:
         raise ConfigError(f"{where}: state its kind, one of {', '.join(KINDS)}")
     needs_m = kind in ("range", "range_bearing", "vector", "position", "pose")
     needs_rad = kind in ("bearing", "bearing3", "range_bearing", "pose", "heading")
-    if needs_m and sensor.sigma_m is None:
+    grows = sensor.sigma_m_per_m > 0.0 and sensor.min_range_m > 0.0 and kind in RELATIVE_ANGLES
+    if needs_m and sensor.sigma_m is None and not grows:
         raise ConfigError(f"{where}: sigma_m is missing")
     if needs_rad and sensor.sigma_rad is None:
         raise ConfigError(f"{where}: sigma_rad is missing")

@@ -38,7 +38,7 @@ def locate(name: str) -> Path:
 def load(name: str, overrides: list[str] | None = None) -> Scenario:
     """Read a scenario and apply `--set` overrides (`links.loss=0.3`, `robots.r2.sensors.range.sigma_m=0.1`)."""
     path = locate(name)
-    data = read_toml(path)
+    data = read_scenario(path)
     for override in overrides or []:
         apply_override(data, override)
     scenario = validate(Scenario, data, str(path))
@@ -51,6 +51,51 @@ def load(name: str, overrides: list[str] | None = None) -> Scenario:
         scenario = scenario.model_copy(update={"robots": [robot for robot in scenario.robots if robot.id in only]})
     check(scenario)
     return scenario
+
+
+def read_scenario(path: Path, below: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """The tables of a file, on top of those of the scenario it `extends`. Raises `ConfigError`.
+
+    Tables are merged key by key, entries of arrays of tables by their id; whatever else the file says takes the place
+    of what the other one says. A path is relative to the file.
+    """
+    data = read_toml(path)
+    base = data.pop("extends", None)
+    if base is None:
+        return data
+    if not isinstance(base, str):
+        raise ConfigError(f"{path}: extends: the name or path of a scenario is needed")
+    beside = path.parent / base
+    try:
+        other = beside if base.endswith(".toml") else locate(base)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: extends: {error}") from None
+    chain = (*below, path.resolve())
+    if other.resolve() in chain:
+        raise ConfigError(f"{path}: extends '{base}', which extends this one; leave one of the two out")
+    return merged(read_scenario(other, chain), data)
+
+
+def merged(base: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
+    """Tables `data` on top of `base`, see `read_scenario`."""
+    found = dict(base)
+    for key, value in data.items():
+        before = base.get(key)
+        if isinstance(before, dict) and isinstance(value, dict):
+            found[key] = merged(before, value)
+        elif isinstance(before, list) and _by_id(before) and _by_id(value):
+            entries = {item["id"]: item for item in before}
+            for item in value:
+                entries[item["id"]] = merged(entries.get(item["id"], {}), item)
+            found[key] = list(entries.values())
+        else:
+            found[key] = value
+    return found
+
+
+def _by_id(value: Any) -> bool:
+    """Whether it is an array of tables that have ids."""
+    return isinstance(value, list) and all(isinstance(item, dict) and "id" in item for item in value)
 
 
 def apply_override(data: dict[str, Any], override: str) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from sim.plots import DASHES, GREY, MAX_PANELS, colour, dash, drawing, logarithmic
+from sim.motion_figures import distances
+from sim.plots import DASHES, GREY, MAX_PAIRS, MAX_PANELS, PALE, colour, dash, drawing, logarithmic
 
 Array = NDArray[np.float64]
 Runs = list[tuple[str, dict[str, Any]]]
@@ -84,6 +85,27 @@ def anees_over_time(series: dict[str, Any], dof: int | None, trials: int, path: 
         logarithmic(axes, between=True)
         axes.set_xlim(series["t_s"][0], series["t_s"][-1])
         axes.set(xlabel="time [s]", ylabel="ANEES")
+        figure.legend(loc="outside right upper")
+    return path
+
+
+def pair_distances(t_s: Array, places: Array, collision_m: float, path: Path) -> Path:
+    """Distances of pairs of robots at places (K, n, 2 or 3): the nearest pair's bold, collisions shaded.
+
+    Of many pairs those `MAX_PAIRS` that come nearest.
+    """
+    gaps = distances(places)[:, *np.triu_indices(places.shape[1], 1)]
+    gaps = gaps[:, np.argsort(gaps.min(axis=0), kind="stable")[:MAX_PAIRS]]
+    with drawing(path, 3.4) as figure:
+        axes = figure.subplots()
+        axes.axhspan(0.0, collision_m, color="#fbe3d6", lw=0, zorder=0)
+        axes.plot(t_s, gaps, color=PALE, lw=0.7, zorder=1)
+        axes.plot(t_s, gaps.min(axis=1), color=colour(0), lw=1.4, zorder=2, label="nearest pair")
+        axes.plot([], [], color=PALE, lw=0.7, label="each pair")
+        axes.fill_between([], [], color="#fbe3d6", label="collision")
+        axes.set_xlim(t_s[0], t_s[-1])
+        axes.set_ylim(bottom=0.0)
+        axes.set(xlabel="time [s]", ylabel="distance [m]")
         figure.legend(loc="outside right upper")
     return path
 

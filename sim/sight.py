@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,30 @@ class Sight:
     def joint(self, observer: Array, k: int) -> Array:
         """What the model takes at instant k: the observer's state (m,), followed by the subject's if it has one."""
         return observer if self.states is None else np.concatenate([observer, self.states[k]])
+
+
+class View(NamedTuple):
+    """What a sensor with a field of view may see: mount on the body, angle, and distances (None: however far)."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    fov_rad: float
+    min_range_m: float
+    max_range_m: float | None
+
+
+def views(scenario: Scenario) -> dict[str, list[View]]:
+    """The fields of view of each robot's sensors, of robots that have any."""
+    found: dict[str, list[View]] = {}
+    for robot in scenario.robots:
+        for sensor in robot.sensors.values():
+            if sensor.fov_rad is not None:
+                x, y, _, _, _, yaw = mount_of(sensor.mount)
+                view = View(x, y, yaw, sensor.fov_rad, sensor.min_range_m, sensor.max_range_m)
+                if view not in found.setdefault(robot.id, []):
+                    found[robot.id].append(view)
+    return found
 
 
 def sights(
@@ -81,6 +106,11 @@ def _ranges_peers(robot: RobotPart) -> bool:
         sensor_kind(name, sensor) == "range" and sensor.two_way and "peers" in sensor.of
         for name, sensor in robot.sensors.items()
     )
+
+
+def steps_between(sensor: SensorPart, step_s: float) -> int:
+    """Steps from one measurement of a sensor to the next."""
+    return 1 if sensor.rate_hz is None else max(1, round(1.0 / (sensor.rate_hz * step_s)))
 
 
 def reach_m(sensor: SensorPart) -> float:

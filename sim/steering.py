@@ -30,6 +30,7 @@ def steered(
     )
     dt, n = scenario.step_s, len(scenario.robots)
     sigma = np.array([[robot.noise.speed_mps, robot.noise.yaw_rate_radps] for robot in scenario.robots])
+    share = np.array([[robot.noise.speed_share, robot.noise.yaw_rate_per_mps] for robot in scenario.robots])
     noise = np.stack([normal_rows(seed, steps, 2, robot.id, "control") for robot in scenario.robots], axis=1)
     poses, commands = np.empty((steps + 1, n, 3)), np.empty((steps, n, 2))
     poses[0] = np.stack([starts[robot.id] for robot in scenario.robots])
@@ -38,7 +39,7 @@ def steered(
     for k in range(steps):
         place, velocity = target[k, :2], (target[k + 1, :2] - target[k, :2]) / dt
         commands[k] = law.commands(poses[k], np.tile(place, (n, 1)), np.tile(velocity, (n, 1)), weights)
-        moves = dt * (commands[k] + sigma * noise[k])
+        moves = dt * (commands[k] + np.hypot(sigma, share * commands[k, :, :1]) * noise[k])
         poses[k + 1] = compose(poses[k], np.stack([moves[:, 0], np.zeros(n), moves[:, 1]], axis=1))
         poses[k + 1, :, 2] = wrap(poses[k + 1, :, 2])
     return (

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.metrics import StateTrace, TrialTrace
+from sim.sight import View
 
 FILE = "trace.npz"
 
@@ -20,12 +21,15 @@ Instants = dict[tuple[str, str], NDArray[np.float64]]
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """A trial's samples with the contacts (time [s], robot, peer), landmarks, and instants of relative measurements."""
+    """A trial's samples with the contacts (time [s], robot, peer), landmarks, instants of relative measurements, and
+    fields of view by robot.
+    """
 
     trace: TrialTrace
     contacts: list[tuple[float, str, str]]
     landmarks: dict[str, tuple[float, float]]
     measured: Instants = field(default_factory=dict)
+    views: dict[str, list[View]] = field(default_factory=dict)
 
 
 def save_trace(
@@ -34,6 +38,7 @@ def save_trace(
     contacts: list[tuple[float, str, str]],
     landmarks: dict[str, tuple[float, ...]],
     measured: Instants | None = None,
+    views: dict[str, list[View]] | None = None,
 ) -> None:
     """Write `trace.npz`, of landmarks x and y.
 
@@ -63,6 +68,7 @@ def save_trace(
         "landmarks": {name: place[:2] for name, place in landmarks.items()},
         "bound": trace.bound is not None,
         "measured": list(measured or {}),
+        "views": views or {},
     }
     np.savez_compressed(run_dir / FILE, meta=np.array(json.dumps(meta)), **arrays)
 
@@ -99,4 +105,5 @@ def load_trace(run_dir: Path) -> Stored | None:
         }
     contacts = [(float(t), str(a), str(b)) for t, a, b in meta["contacts"]]
     landmarks = {name: (float(x), float(y)) for name, (x, y) in meta["landmarks"].items()}
-    return Stored(trace, contacts, landmarks, measured)
+    views = {name: [View(*item) for item in items] for name, items in meta.get("views", {}).items()}
+    return Stored(trace, contacts, landmarks, measured, views)

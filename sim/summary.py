@@ -10,6 +10,7 @@ from agent.fault_words import told
 from sim.engine import TrialResult
 from sim.fault_plan import trial_faults
 from sim.metrics import combine, reduce_trial
+from sim.motion_figures import over_trials
 from sim.scenario import BoundPart, Scenario
 
 SCHEMA = 1
@@ -26,7 +27,9 @@ def reduce(scenario: Scenario, result: TrialResult) -> dict[str, Any]:
         "nis": result.nis,
         "repairs": _total(result, "update.not_positive_definite"),
         "quarantines": [_total(result, "health.quarantined"), _total(result, "health.readmitted")],
+        "motion": result.motion,
         "step_us": result.step_us,
+        "plan_us": result.plan_us,
     }
 
 
@@ -69,6 +72,7 @@ def summarize(
         "window_s": list(scenario.window_s),
         "simulated_s": simulated_s,
         **figures,
+        "motion": {**over_trials([item["motion"] for item in reduced]), "collision_m": scenario.collision_m},
         "network": {
             **{key: network[key] for key in ("sent", "delivered", "lost", "bytes")},
             "bytes_per_robot_s": network["bytes"] / seconds if seconds else 0.0,

@@ -67,6 +67,21 @@ def targets(summary: dict[str, Any]) -> str:
     return table(header, rows, classes)
 
 
+def motion(summary: dict[str, Any]) -> str:
+    """Where robots were in relation to each other; empty where nobody knows, and for a run from before it was kept."""
+    found = summary.get("motion", {})
+    if found.get("speed_mps") is None:
+        return ""
+    collisions = "collisions" if summary["trials"] == 1 else "collisions per trial"
+    header = [collisions, "smallest distance [m]", "time connected", "robots that see a target", "mean speed [m/s]"]
+    shares = [found["connected_share"], found["target_seen_share"]]
+    row = [number(found["collisions"], 0 if summary["trials"] == 1 else 2), number(found["min_distance_m"], 2)]
+    row += ["–" if share is None else f"{100.0 * share:.0f} %" for share in shares]
+    text = f"A collision: two robots come nearer than {found['collision_m']:g} m. Connected: all hear each other, "
+    text += "if not directly then through others, as far as the radio reaches. Shares and speed are over the window."
+    return section("Motion", table(header, [[*row, number(found["speed_mps"], 2)]]), text)
+
+
 # --- extremes ----------------------------------------------------------------------------------------------
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 from agent.config_file import ConfigError
 from agent.node import Recorder
+from sim.closed_loop import read_motion
 from sim.engine import FateSink, TrialResult, VirtualEngine
 from sim.invariants import InvariantChecker
 from sim.lives import LifeSink
@@ -23,6 +25,22 @@ def open_world(scenario: Scenario, seed: int) -> World:
         return RecordedWorld(scenario, seed)
     except RecordingError as error:
         raise ConfigError(f"{scenario.name}: world.path: {error}") from None
+
+
+def played_world(scenario: Scenario, seed: int, motion: Path) -> World:
+    """The world of a run that another process has played, as far as it goes.
+
+    `motion` is its file of where robots went that choose their motion. Raises `ConfigError` when it can't be had.
+    """
+    if not scenario.planners():
+        return open_world(scenario, seed)
+    world = SimulatedWorld(scenario, seed, played=True)
+    try:
+        read_motion(motion, world.motion)
+    except OSError as error:
+        raise ConfigError(f"{motion}: where the robots went cannot be read ({error.strerror})") from None
+    world.locate()
+    return world
 
 
 def run_trial(

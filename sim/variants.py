@@ -101,7 +101,7 @@ def _bound_key(scenario: Scenario) -> str:
     """Everything the reduced centralized filter follows from, and perhaps a little more."""
     whole: dict[str, Any] = {key: value for key, value in table(scenario).items() if key not in _IRRELEVANT}
     used = scenario.localization
-    whole["localization"] = [used.transform, used.innovation_cap]
+    whole["localization"] = [used.transform or "unscented", used.innovation_cap]
     for robot in whole["robots"]:
         for own in ("localization", "tracking", "lateness", "autopilot"):
             robot.pop(own, None)

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from agent import frames
+from agent.flight_modes import ROVERS, Controls, controls
+from sim.vehicle_control import VehicleControl
 
 Array = NDArray[np.float64]
 
@@ -21,6 +23,8 @@ HDG_UNKNOWN = 65535
 MAX_MOVES = 1024
 """Increments of odometry by which a late fix is carried on."""
 FLAVOURS = {"ardupilot": dialect.MAV_AUTOPILOT_ARDUPILOTMEGA, "px4": dialect.MAV_AUTOPILOT_PX4}
+VEHICLES = {False: dialect.MAV_TYPE_GROUND_ROVER, True: dialect.MAV_TYPE_QUADROTOR}
+"""MAVLink's type of a vehicle, by whether it flies."""
 SENDS = ("odometry", "global_position", "attitude", "local_position")
 
 NEEDS = {
@@ -49,6 +53,7 @@ class StandInSettings:
     """One vehicle. `boot_ns` is the fleet instant at which it was switched on; `sends` what it can tell.
 
     `own_fixes`: the positions it tells are those of `set_fix` alone, and there is none before the first.
+    `armed`, `mode`: how it is found at the start; without a mode in one that a person drives in.
     """
 
     system_id: int = 1
@@ -59,6 +64,8 @@ class StandInSettings:
     vehicle_type: int = dialect.MAV_TYPE_GROUND_ROVER
     gps_accuracy_m: float | None = None
     own_fixes: bool = False
+    armed: bool = False
+    mode: str | None = None
 
     def __post_init__(self) -> None:
         if self.flavour not in FLAVOURS:
@@ -66,6 +73,16 @@ class StandInSettings:
         for name in self.sends:
             if name not in SENDS:
                 raise ValueError(f"sends: '{name}' is unknown; valid: {', '.join(SENDS)}")
+        modes = self.controls().modes
+        if self.mode is not None and self.mode not in modes:
+            raise ValueError(f"mode: '{self.mode}' is unknown; valid: {', '.join(modes)}")
+
+    def controls(self) -> Controls:
+        """How it is steered. Raises ValueError for a type of vehicle that nobody knows how to steer."""
+        found = controls(FLAVOURS[self.flavour], self.vehicle_type)
+        if found is None:
+            raise ValueError(f"vehicle_type: {self.vehicle_type} is neither a copter nor a rover")
+        return found
 
 
 @dataclass(slots=True)
@@ -93,10 +110,13 @@ class Telemetry:
         self._global: Pose | None = None
         self._state_velocity = np.zeros(4)
         self.reboot(settings.boot_ns)
+        self.control.armed = settings.armed
 
     def reboot(self, now_ns: int) -> None:
-        """Switched on at `now_ns`: the boot clock and the local frame begin anew."""
+        """Switched on at `now_ns`, disarmed: the boot clock and the local frame begin anew."""
         self._boot_ns = now_ns
+        kind, mode = self.settings.vehicle_type, self.settings.mode
+        self.control = VehicleControl(self.settings.controls(), kind, now_ns, lambda: self._believed().heading, mode)
         self._local = Pose(now_ns, np.zeros(3), 0.0)
         self._odometry_ns: int | None = None
         self._body_velocity: Array | None = None
@@ -221,9 +241,9 @@ class Telemetry:
                     sensors, sensors, sensors, 100, 12000, -1, 90, 0, 0, 0, 0, 0, 0
                 )
             case "EXTENDED_SYS_STATE":
-                return dialect.MAVLink_extended_sys_state_message(
-                    dialect.MAV_VTOL_STATE_UNDEFINED, dialect.MAV_LANDED_STATE_ON_GROUND
-                )
+                flies = self.control.armed and self.settings.vehicle_type not in ROVERS
+                landed = dialect.MAV_LANDED_STATE_IN_AIR if flies else dialect.MAV_LANDED_STATE_ON_GROUND
+                return dialect.MAVLink_extended_sys_state_message(dialect.MAV_VTOL_STATE_UNDEFINED, landed)
             case "EKF_STATUS_REPORT":
                 flags = EKF_GLOBAL if self.gps_aided else EKF_ATTITUDE_ONLY
                 return dialect.MAVLink_ekf_status_report_message(flags, 0.05, 0.05, 0.05, 0.05, 0.0)
@@ -232,12 +252,13 @@ class Telemetry:
         return None
 
     def heartbeat(self) -> Any:
+        armed = self.control.armed
         return dialect.MAVLink_heartbeat_message(
             self.settings.vehicle_type,
             FLAVOURS[self.settings.flavour],
-            dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED,
-            0,
-            dialect.MAV_STATE_STANDBY,
+            dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | (dialect.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0),
+            self.control.mode,
+            dialect.MAV_STATE_ACTIVE if armed else dialect.MAV_STATE_STANDBY,
             3,
         )
 

@@ -9,17 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.config_file import ConfigError
-from agent.config_parts import start_size
+from agent.effects import Steer
 from agent.estimation.gain_motion import reported
 from agent.estimation.gaussian import wrap, wrap_components
-from agent.estimation.motion import LAYOUTS, SPATIAL, UNICYCLE_GAINS, StateLayout, velocity_step
+from agent.estimation.motion import LAYOUTS, SPATIAL, UNICYCLE_GAINS
 from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, OutOfViewError
 from agent.estimation.odometry import OdometryNoise
 from agent.settings import NS, nanoseconds
 from agent.timeline import Phase
+from sim.closed_loop import ClosedLoop, Motion, increment, planar_of
+from sim.motion import driven
 from sim.noise import generator, normal_rows
 from sim.scenario import RobotPart, Scenario, SensorPart, TargetPart, sensor_kind
-from sim.sight import places, sights
+from sim.sight import places, sights, steps_between
 from sim.steering import steered
 
 Array = NDArray[np.float64]
@@ -47,13 +49,19 @@ class Output:
 
 
 class World(Protocol):
-    """What an engine needs of a world, simulated or recorded. Instant k is k steps after the start."""
+    """What an engine needs of a world, simulated or recorded. Instant k is k steps after the start.
+
+    In a world of `closed_loop` robots move as they are told: truth is there up to the instant whose `outputs` were
+    asked for last, NaN of what is not played. They are asked for once, in order, after all commands before them.
+    """
 
     robots: tuple[str, ...]
     targets: tuple[str, ...]
     landmarks: dict[str, tuple[float, ...]]
     steps: int
     step_ns: int
+    seed: int
+    closed_loop: bool
 
     def start_belief(self, entity: str) -> tuple[Array, Array]:
         """Initial mean (n,) and covariance (n, n) given to the estimators."""
@@ -71,17 +79,19 @@ class World(Protocol):
         """All data with instants in (k - 1, k], in order of (instant, phase, robot, subject)."""
         ...
 
+    def steer(self, robot: str, t_ns: int, steer: Steer) -> None:
+        """A robot is told to move from `t_ns` on, until `steer.until_ns`, both since the start.
+
+        Raises `ValueError` for a robot that does not choose its motion.
+        """
+        ...
+
 
 def control_odometry(robot: RobotPart, step_s: float) -> OdometryNoise:
     """The odometry noise a robot's estimator assumes: stated, or that of its control noise."""
     if robot.odometry is not None:
         return robot.odometry.noise()
-    root = float(np.sqrt(step_s))
-    return OdometryNoise(
-        along_m_per_sqrt_s=robot.noise.speed_mps * root,
-        vertical_m_per_sqrt_s=robot.noise.climb_mps * root,
-        heading_rad_per_sqrt_s=robot.noise.yaw_rate_radps * root,
-    )
+    return robot.noise.odometry(step_s)
 
 
 def order(output: Output) -> tuple[int, int, str, str]:
@@ -123,11 +133,13 @@ class SimulatedWorld:
     """Truth and sensors of a `[world] kind = "simulated"` scenario for one seed.
 
     Controls are held over a step and carry white noise; odometry reports the commanded motion, so that
-    truth = odometry (+) noise with the covariance the odometry states.
+    truth = odometry (+) noise with the covariance the odometry states. Robots with planning drive by commands that are
+    given while the world is played, the others in the same world by their constant controls.
     """
 
-    def __init__(self, scenario: Scenario, seed: int) -> None:
-        self._scenario, self._seed = scenario, seed
+    def __init__(self, scenario: Scenario, seed: int, *, played: bool = False) -> None:
+        """`played`: `motion` of robots with planning is filled in afterwards, and the loop is not closed."""
+        self._scenario, self.seed = scenario, seed
         self.robots = tuple(robot.id for robot in scenario.robots)
         self.targets = tuple(target.id for target in scenario.targets)
         self.landmarks = {item.id: item.place() for item in scenario.landmarks}
@@ -137,7 +149,7 @@ class SimulatedWorld:
         self._tracks: dict[str, Array] = {}
         self._commands: dict[str, Array] = {}
         for target in scenario.targets:
-            self._tracks[target.id] = self._drive(target, start_pose(target, phases, seed))
+            self._tracks[target.id] = driven(scenario, target, start_pose(target, phases, seed), seed, self.steps)
         starts = {robot.id: start_pose(robot, phases, seed) for robot in scenario.robots}
         if scenario.world.steering is not None:
             around = self._tracks[scenario.targets[0].id]
@@ -146,10 +158,18 @@ class SimulatedWorld:
             self._commands |= commands
         else:
             for robot in scenario.robots:
-                self._tracks[robot.id] = self._drive(robot, starts[robot.id])
+                self._tracks[robot.id] = driven(scenario, robot, starts[robot.id], seed, self.steps)
+        self.motion = Motion()
+        for robot in scenario.planners():
+            states = self.motion.states[robot.id] = self._tracks[robot.id]
+            states[1:, planar_of(robot)] = np.nan
+            self.motion.moved[robot.id] = np.full((self.steps, 3), np.nan)
+        self.closed_loop = bool(self.motion.states) and not played
+        self._loop = ClosedLoop(scenario, self.motion, seed, self.step_ns) if self.closed_loop else None
         movers = scenario.movers()
         self._index = {name: index for index, name in enumerate(movers)}
-        self._places = np.stack([places(self._tracks[name], LAYOUTS[part.model]) for name, part in movers.items()])
+        self._layouts = {name: LAYOUTS[part.model] for name, part in movers.items()}
+        self._places = np.stack([places(self._tracks[name], layout) for name, layout in self._layouts.items()])
         self._fixed = np.array([(*point, 0.0)[:3] for point in self.landmarks.values()]).reshape(-1, 3)
         self._odometry_noise = {robot.id: control_odometry(robot, scenario.step_s) for robot in scenario.robots}
         self._sights = sights(scenario, self._tracks, self.landmarks)
@@ -160,54 +180,6 @@ class SimulatedWorld:
         }
         self._sensor_noise: dict[tuple[str, str, str], Array] = {}
 
-    def _drive(self, mover: RobotPart | TargetPart, start: Array) -> Array:
-        """True states (steps + 1, n)."""
-        layout = LAYOUTS[mover.model]
-        size = start_size(layout)
-        if len(start) != size:
-            raise ConfigError(f"{self._scenario.name}: {mover.id}.start.pose needs {size} numbers for '{mover.model}'")
-        if layout.heading is None:
-            assert isinstance(mover, TargetPart)
-            return self._drift(mover, layout, start)
-        dt = self._scenario.step_s
-        noise = normal_rows(self._seed, self.steps, 2, mover.id, "control")
-        track = np.zeros((self.steps + 1, layout.dim))
-        track[0] = [*start, *[1.0] * (layout.dim - size)]
-        control = np.array([mover.control.speed_mps, mover.control.yaw_rate_radps])
-        sigma = np.array([mover.noise.speed_mps, mover.noise.yaw_rate_radps])
-        moves = dt * (control + sigma * noise)
-        heading = np.cumsum(np.append(track[0, layout.heading], moves[:, 1]))
-        along = np.stack([np.cos(heading[:-1]), np.sin(heading[:-1])], axis=1) * moves[:, :1]
-        track[:, :2] = np.cumsum(np.concatenate([track[:1, :2], along]), axis=0)
-        track[:, layout.heading] = wrap(heading)
-        if layout is SPATIAL:
-            up = normal_rows(self._seed, self.steps, 1, mover.id, "altitude")[:, 0]
-            if mover.model == "quadrotor":
-                track[1:, 2] = mover.control.altitude_m + mover.noise.altitude_m * up
-            else:
-                track[1:, 2] = start[2] + dt * np.cumsum(mover.control.climb_mps + mover.noise.climb_mps * up)
-        if layout is UNICYCLE_GAINS:
-            assert isinstance(mover, RobotPart)
-            walk = mover.gain_walk_per_sqrt_s * np.sqrt(dt)
-            steps = normal_rows(self._seed, self.steps, 2, mover.id, "gains")
-            track[1:, 3:] += walk * np.cumsum(steps, axis=0) + 1.0
-        return track
-
-    def _drift(self, target: TargetPart, layout: StateLayout, start: Array) -> Array:
-        """True states (steps + 1, n) of a target that is pushed at random."""
-        dt, axes = self._scenario.step_s, len(layout.position)
-        F, Q = velocity_step(layout, dt, target.damping_s)
-        order = layout.dim // axes
-        sigma = target.noise.jerk_mps3 if order == 3 else target.noise.acceleration_mps2
-        root = np.linalg.cholesky(Q[::axes, ::axes]) * sigma * np.sqrt(dt)
-        names = ("control", "acceleration", "jerk")[:order]
-        draws = np.stack([normal_rows(self._seed, self.steps, axes, target.id, name) for name in names], axis=1)
-        track = np.zeros((self.steps + 1, layout.dim))
-        track[0] = start
-        for k in range(self.steps):
-            track[k + 1] = F @ track[k] + (root @ draws[k]).ravel()
-        return track
-
     def truth(self, entity: str, k: int) -> Array:
         return np.asarray(self._tracks[entity][k])
 
@@ -217,24 +189,33 @@ class SimulatedWorld:
     def start_belief(self, entity: str) -> tuple[Array, Array]:
         part = self._scenario.movers()[entity]
         cov = part.start_sigma.covariance(part.model)
-        return drawn_belief(self._tracks[entity][0], cov, self._seed, entity, LAYOUTS[part.model].angles)
+        return drawn_belief(self._tracks[entity][0], cov, self.seed, entity, LAYOUTS[part.model].angles)
+
+    def steer(self, robot: str, t_ns: int, steer: Steer) -> None:
+        if self._loop is None:
+            raise ValueError(f"{robot} cannot be steered: no robot of {self._scenario.name} has a planning.kind")
+        self._loop.steer(robot, t_ns, steer)
+
+    def locate(self) -> None:
+        """Take over places from `motion` after it was filled in."""
+        for name, states in self.motion.states.items():
+            self._places[self._index[name]] = places(states, self._layouts[name])
 
     def outputs(self, k: int) -> list[Output]:
+        if self._loop is not None:
+            self._loop.play(k)
+            for name, states in self.motion.states.items():
+                self._places[self._index[name], k] = places(states[k], self._layouts[name])
         found: list[Output] = []
         there = np.concatenate([self._places[:, k], self._fixed])
         gaps = np.linalg.norm(there[:, None] - there, axis=-1).tolist()
         for robot in self._scenario.robots:
             found.append(self._odometry(robot, k))
             for name, sensor in robot.sensors.items():
-                if k % self._every(sensor) == 0:
+                if k % steps_between(sensor, self._scenario.step_s) == 0:
                     found.extend(self._sense(robot, name, sensor, k, gaps[self._index[robot.id]]))
         found.sort(key=order)
         return found
-
-    def _every(self, sensor: SensorPart) -> int:
-        if sensor.rate_hz is None:
-            return 1
-        return max(1, round(1.0 / (sensor.rate_hz * self._scenario.step_s)))
 
     def _odometry(self, robot: RobotPart, k: int) -> Output:
         dt = self._scenario.step_s
@@ -243,6 +224,8 @@ class SimulatedWorld:
         if robot.id in self._commands:
             speed, yaw_rate = self._commands[robot.id][k - 1]
         delta = dt * np.array([speed, 0.0, control.climb_mps, yaw_rate])
+        if robot.id in self.motion.moved:
+            delta = increment(robot, self.motion.moved[robot.id][k - 1], dt)
         noise = self._odometry_noise[robot.id]
         if LAYOUTS[robot.model] is UNICYCLE_GAINS:
             delta[[0, 1, 3]] = reported(self._tracks[robot.id][k - 1], delta[[0, 1, 3]])
@@ -254,7 +237,7 @@ class SimulatedWorld:
     def _noise(self, robot: str, sensor: str, of: str, k: int, size: int) -> Array:
         key = (robot, sensor, of)
         if key not in self._sensor_noise:
-            self._sensor_noise[key] = normal_rows(self._seed, self.steps + 1, size, *key)
+            self._sensor_noise[key] = normal_rows(self.seed, self.steps + 1, size, *key)
         return np.asarray(self._sensor_noise[key][k])
 
     def _sense(self, robot: RobotPart, name: str, sensor: SensorPart, k: int, gaps: list[float]) -> list[Output]:

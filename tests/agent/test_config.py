@@ -11,19 +11,15 @@ import numpy as np
 import pytest
 import tomli_w
 
-from agent.config import AgentConfig, load_agent_config
+from agent.config import AgentConfig, MavlinkPart, load_agent_config
 from agent.config_file import ConfigError, validate
-from agent.config_parts import (
-    ControlNoisePart,
-    ControlPart,
-    LocalizationPart,
-    OdometryPart,
-    SigmaPart,
-)
+from agent.config_parts import LocalizationPart, SigmaPart
 from agent.estimation.motion import SPATIAL, HeldAltitude, SpatialMotion
 from agent.estimation.mounting import planar_mount
 from agent.estimation.observation import Intrinsics
+from agent.motion_parts import ControlNoisePart, ControlPart, OdometryPart
 from agent.settings import AgentSettings, CoastSettings, UnsafeSettings
+from agent.steering_link import SteeringSettings
 from agent.target_parts import target_motion
 from agent.unsafe_parts import UnsafePart
 
@@ -273,6 +269,15 @@ MISTAKES: list[tuple[dict[str, Any], list[str]]] = [
         ["clock.source", "mavlink.simulated = true"],
     ),
     ({"mavlink": {"endpoint": "udpin:127.0.0.1:14550"}, "injection": {"seed": 1}}, ["[injection]", "remove it"]),
+    (
+        {"mavlink": {"endpoint": "udpin:127.0.0.1:14550", "steer": True}},
+        ["mavlink.steer = true needs a planner", "set planning.kind"],
+    ),
+    ({"mavlink": {"endpoint": "udpin:127.0.0.1:14550", "arm": True}}, ["mavlink.arm = true", "mavlink.steer = true"]),
+    (
+        {"mavlink": {"endpoint": "udpin:127.0.0.1:14550", "set_mode": True}},
+        ["mavlink.set_mode = true", "mavlink.steer = true"],
+    ),
     ({"localization": {"correlation": "ignored"}}, ["localization: correlation = 'ignored'", "add form ="]),
     ({"localization": {"kind": "replica"}}, ["key 'team' is missing", "every other robot"]),
     (
@@ -374,3 +379,22 @@ def test_switches_change_what_they_name(tmp_path: Path) -> None:
 
 def test_health_that_judges_nobody_is_refused(tmp_path: Path) -> None:
     assert "health.gate_nis" in complaint(tmp_path, example(health={"gate_nis": 5.0}))
+
+
+def test_a_vehicle_is_steered_only_if_that_is_switched_on() -> None:
+    plain = MavlinkPart(endpoint="udpin:127.0.0.1:14550")
+    plain.check_steering("none")
+    assert plain.settings([0.0, 0.0, 0.0]).steering is None
+    steered = MavlinkPart(endpoint="udpin:127.0.0.1:14550", steer=True)
+    steered.check_steering("potential")
+    assert steered.settings([0.0, 0.0, 0.0]).steering == SteeringSettings(arm=False, set_mode=False)
+    told = MavlinkPart(endpoint="udpin:127.0.0.1:14550", steer=True, arm=True)
+    assert told.settings([0.0, 0.0, 0.0]).steering == SteeringSettings(arm=True, set_mode=False)
+
+
+def test_what_is_planned_may_be_steered_by(tmp_path: Path) -> None:
+    mavlink = {"endpoint": "serial:/dev/ttyAMA0:921600", "steer": True}
+    planning = {"kind": "potential", "overrun_s": 0.25}
+    planned = load_agent_config(write(tmp_path, example(mavlink=mavlink, planning=planning)))
+    assert planned.settings(0).planning.overrun_ns == 250_000_000
+    assert planned.mavlink is not None and planned.mavlink.steer and not planned.mavlink.arm

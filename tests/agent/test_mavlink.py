@@ -20,7 +20,8 @@ from agent.autopilot import AutopilotReader, Output
 from agent.autopilot_settings import AutopilotSettings
 from agent.events import Fix, Odometry
 from agent.fleet_clock import FleetClock
-from agent.mavlink import MavlinkError, MavlinkLink, SerialLine, parse_endpoint
+from agent.mavlink import MavlinkLink, SerialLine
+from agent.mavlink_endpoint import MavlinkError, parse_endpoint
 from network.transport import free_port
 from sim.autopilot import StandIn, StandInServer, StandInSettings
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agent.effects import Effect
+from agent.effects import Effect, Steer
 from agent.estimation.gaussian import is_positive_definite
 from agent.estimation.mounting import planar_mount
 from agent.estimation.observation import Intrinsics
@@ -57,6 +57,14 @@ def introduced() -> tuple[Node, Node]:
         for packet in speaker.on_tick(1).packets:
             listener.on_packet(1, packet)
     return one, other
+
+
+def test_the_newest_motion_that_is_chosen_comes_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = node("r1")
+    assert one.on_tick(1).steer is None
+    old, new = (Steer((speed, 0.0, 0.0), 0.0, 2 * S) for speed in (0.25, 0.5))
+    monkeypatch.setattr(one.agent, "handle", lambda event: [old, new])
+    assert one.on_event(Tick(S)).steer == new
 
 
 # --- what happens between two robots ----------------------------------------------------------------------

@@ -13,8 +13,18 @@ from hypothesis import strategies as st
 from agent.config import AgentConfig
 from agent.config_file import validate
 from agent.core import Agent
-from agent.effects import Alarm, Broadcast, Effect, Estimate, Publish, Send, TrackEstimate
-from agent.events import Event, Fix, LinkChange, Observation, Odometry, Received, Tick
+from agent.effects import Alarm, Broadcast, Effect, Estimate, Publish, Send, Steer, TrackEstimate
+from agent.events import (
+    ControlReport,
+    Event,
+    Fix,
+    LinkChange,
+    Observation,
+    Odometry,
+    PlannerOverrun,
+    Received,
+    Tick,
+)
 from agent.recording import (
     RecordingError,
     RecordingWriter,
@@ -41,6 +51,7 @@ from network.messages import (
     Snapshot,
     TargetBelief,
 )
+from tests.network.test_wire import example_round
 
 S = 1_000_000_000
 
@@ -289,6 +300,10 @@ VALUES: list[Any] = [
     Broadcast(Channel.BELIEF, 5, Hello("v")),
     Publish(Estimate(5, "unicycle", np.zeros(3), np.eye(3), (TrackEstimate("t1", "unicycle", np.ones(3), np.eye(3)),))),
     Alarm("lost", "r2"),
+    Received(3, Message(HEADER, example_round())),
+    Steer((0.5, 0.0, -0.0), 0.25, 7),
+    ControlReport(3, None),
+    PlannerOverrun(3),
 ]
 
 

@@ -28,6 +28,7 @@ from network.messages import (
     Belief,
     Body,
     ClockEcho,
+    Correction,
     Epoch,
     Header,
     Hello,
@@ -41,6 +42,8 @@ from network.messages import (
     RawMeasurement,
     Reckoning,
     ReplyStatus,
+    RoundReport,
+    RoundStage,
     Snapshot,
     SplitReply,
     SplitRequest,
@@ -143,6 +146,17 @@ def example_joint(met: bool = True) -> JointSnapshot:
     return dataclasses.replace(found, factor=factor, line=np.eye(7) + 0.125, lines=lines, anew=True)
 
 
+def example_round() -> RoundReport:
+    """A robot before the corrections of a round, with a target it has seen and one it has heard of."""
+    targets = (
+        TargetBelief("t1", Belief("unicycle", np.array([8.0, 4.0, 2.0]), np.diag([4.0, 4.0, 1.0])), 900),
+        TargetBelief("t2", Belief("constant_velocity", np.arange(4.0), np.eye(4) * 2), 0),
+    )
+    seen = Correction("t1", np.array([8.5, 4.25]), np.eye(2) / 16, np.diag([0.5, 0.25]))
+    belief = Belief("unicycle", np.array([1.5, -2.0, 0.25]), np.diag([0.25, 0.5, 0.01]))
+    return RoundReport(RoundStage.PRIOR, belief, np.array([0.5, 0.0, 0.0]), -0.125, targets, (seen,))
+
+
 EXAMPLES: dict[str, Body] = {
     "hello": Hello("0.1.0", (ClockEcho("r2", 10, 20), ClockEcho("r3", 30, 40))),
     "pair_request": example_request(),
@@ -155,6 +169,7 @@ EXAMPLES: dict[str, Body] = {
     "joint_request": PairRequest(Epoch(1_000, "r1", 9), example_request().measurements, example_joint()),
     "joint_reply": PairReply(Epoch(1_000, "r2", 9), ReplyStatus.OK, example_joint(met=False)),
     "start_request": StartRequest(Epoch(1000, "r1", 9)),
+    "round_report": example_round(),
     "life_notice": LifeNotice(2**53 - 1, 9, True),
 }
 
@@ -319,9 +334,28 @@ def raw_measurements(draw: st.DrawFn, source: str, t_ns: int, index: int) -> Raw
 
 
 @st.composite
+def rounds(draw: st.DrawFn) -> RoundReport:
+    stage = draw(st.sampled_from(RoundStage))
+    names = sorted(draw(st.lists(ids, max_size=3, unique=True)))
+    corrections = []
+    for name in names if stage is RoundStage.PRIOR else []:
+        d = draw(st.sampled_from((2, 3)))
+        corrections.append(Correction(name, draw(arrays(d)), draw(covariances(d)), draw(covariances(d))))
+    rate = draw(st.floats(-1e3, 1e3))
+    return RoundReport(
+        stage,
+        draw(beliefs()),
+        np.array(draw(st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3))),
+        rate,
+        tuple(TargetBelief(name, draw(beliefs()), draw(stamps)) for name in names),
+        tuple(corrections),
+    )
+
+
+@st.composite
 def messages(draw: st.DrawFn) -> Message:
     header = Header(draw(ids), *(draw(stamps) for _ in range(5)))
-    kinds = ["hello", "request", "reply", "split request", "split reply", "report", "joint"]
+    kinds = ["hello", "request", "reply", "split request", "split reply", "report", "joint", "round"]
     kind = draw(st.sampled_from(kinds))
     body: Body
     if kind == "hello":
@@ -340,6 +374,8 @@ def messages(draw: st.DrawFn) -> Message:
         body = SplitRequest(epoch, tuple(measured), draw(split_snapshots()))
     elif kind == "report":
         body = draw(reports(header.source, header.t_meas_ns))
+    elif kind == "round":
+        body = draw(rounds())
     elif kind == "joint":
         epoch = Epoch(draw(stamps), header.source, draw(stamps))
         body = PairRequest(epoch, (draw(measurements()),), draw(joint_snapshots()))

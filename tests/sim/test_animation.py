@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from sim.animation import MAX_FRAMES, SCRIPT, film, pack, player, unpack
 from sim.metrics import StateTrace, TrialTrace, position_errors
+from sim.sight import View
 from sim.store import Stored
 
 Array = NDArray[np.float64]
@@ -74,6 +76,17 @@ def test_meetings_are_spells_and_contacts_are_told_once_per_instant() -> None:
     assert made["contacts"] == [{"pair": ("r1", "r2"), "t": [5.0, 9.12]}]
     assert made["seen"][0] == {"robot": "r1", "of": "r2", "spells": [[3.0, 19.0]]}
     assert made["landmarks"] == [{"name": "L1", "at": [1.0, 2.0]}]
+
+
+def test_fields_of_view_are_in_the_film_of_who_has_some() -> None:
+    plain = stored()
+    seeing = replace(plain, views={"r2": [View(0.2, 0.0, 0.5, 1.0, 2.0, None)]})
+    made = film(seeing)
+    assert [robot["views"] for robot in made["robots"]] == [[], [(0.2, 0.0, 0.5, 1.0, 2.0, None)]]
+    json.dumps(made, allow_nan=False)
+    assert "Sectors: " in player(seeing)
+    assert "<label hidden>" in player(plain)
+    assert "Sectors: " not in player(plain)
 
 
 def test_a_long_trial_and_a_big_fleet_stay_small() -> None:

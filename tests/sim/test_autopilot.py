@@ -186,9 +186,9 @@ def test_commands_for_other_vehicles_are_left_alone() -> None:
     assert stand_in.counters["other_target"] == 1
 
 
-def test_flight_commands_are_not_supported() -> None:
+def test_other_flight_commands_are_not_supported() -> None:
     stand_in = vehicle()
-    answer = stand_in.receive(BOOT, command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 1.0))
+    answer = stand_in.receive(BOOT, command(dialect.MAV_CMD_NAV_TAKEOFF, 1.0))
     (ack,) = decoded(answer)
     assert (ack.result, ack.target_system, ack.target_component) == (dialect.MAV_RESULT_UNSUPPORTED, 255, 190)
 
@@ -220,6 +220,10 @@ def test_wrong_settings_name_what_is_valid() -> None:
         StandInSettings(flavour="betaflight")
     with pytest.raises(ValueError, match=r"sends.*odometry"):
         StandInSettings(sends=("lidar",))
+    with pytest.raises(ValueError, match=r"mode: 'OFFBOARD'.*GUIDED"):
+        StandInSettings(mode="OFFBOARD")
+    with pytest.raises(ValueError, match="vehicle_type: 1 "):
+        StandInSettings(vehicle_type=dialect.MAV_TYPE_FIXED_WING)
 
 
 @given(
@@ -227,7 +231,13 @@ def test_wrong_settings_name_what_is_valid() -> None:
 )
 def test_no_command_can_hurt(parameters: list[float], number: int) -> None:
     stand_in = vehicle()
-    for choice in (number, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, dialect.MAV_CMD_REQUEST_MESSAGE):
+    for choice in (
+        number,
+        dialect.MAV_CMD_SET_MESSAGE_INTERVAL,
+        dialect.MAV_CMD_REQUEST_MESSAGE,
+        dialect.MAV_CMD_COMPONENT_ARM_DISARM,
+        dialect.MAV_CMD_DO_SET_MODE,
+    ):
         assert names(stand_in.receive(BOOT, command(choice, *parameters)))[0] == "COMMAND_ACK"
     stand_in.outgoing(BOOT + S)
     assert stand_in.next_deadline_ns() > BOOT + S

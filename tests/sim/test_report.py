@@ -88,6 +88,16 @@ def summary_of(traces: list[TrialTrace], **change: Any) -> dict[str, Any]:
     }
 
 
+MOTION = {
+    "collisions": 3.0,
+    "min_distance_m": 0.87,
+    "connected_share": 0.75,
+    "speed_mps": 0.42,
+    "target_seen_share": 0.31,
+    "collision_m": 1.5,
+}
+
+
 class Page(HTMLParser):
     """What a reader sees: texts, pictures, rows of tables; and whatever would be fetched from elsewhere."""
 
@@ -359,3 +369,19 @@ def test_colours_are_told_apart_by_anyone() -> None:
     assert least_gap(plots.PALETTE) > 0.18
     assert least_gap(("#2ca02c", "#d62728")) < 0.18
     assert len({plots.colour(index) for index in range(len(plots.PALETTE))}) == len(plots.PALETTE)
+
+
+def test_motion_is_told_and_distances_are_drawn(tmp_path: Path) -> None:
+    trace = trial(1)
+    page = Page(write_report(tmp_path, summary_of([trace], motion=MOTION), kept(trace), "moving"))
+    assert ["3", "0.87", "75 %", "31 %", "0.42"] in page.rows
+    assert "nearer than 1.5 m" in page.text
+    assert page.pictures["How far robots were from each other"].startswith(PNG)
+
+
+def test_motion_nobody_knows_is_left_out(tmp_path: Path) -> None:
+    trace = trial(1)
+    unknown = {**dict.fromkeys(MOTION), "collision_m": 1.5}
+    page = Page(write_report(tmp_path, summary_of([trace], motion=unknown), kept(trace), "moving"))
+    assert "Motion" not in page.text
+    assert "How far robots were from each other" not in page.pictures

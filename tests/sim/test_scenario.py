@@ -157,6 +157,8 @@ MISTAKES: list[tuple[str, list[str]]] = [
         "targets=[{id='t1',model='quadrotor',start_sigma={position_m=1.0,altitude_m=1.0,heading_rad=1.0}}]",
         ["targets.t1.noise", "altitude_m above 0"],
     ),
+    ("robots.r1.autopilot.mode=OFFBOARD", ["robots.r1.autopilot.mode: 'OFFBOARD'", "GUIDED"]),
+    ("robots.r1.autopilot={flavour='px4',mode='GUIDED'}", ["robots.r1.autopilot.mode: 'GUIDED'", "OFFBOARD"]),
     ("world.placement.reaches=r9", ["world.placement.reaches = 'r9'", "r1, r2, r3, r4"]),
     ('world={kind="recording"}', ["world.path is missing", "--set world.path="]),
     ('world={kind="simulated"}', ["robots.r1.start.circle", "[world.placement]"]),
@@ -207,7 +209,7 @@ def test_the_joint_form_has_the_same_tracks_all_the_time() -> None:
 
 def test_an_unknown_scenario_is_answered_with_the_nearest_name() -> None:
     assert "did you mean 'ut-clat'?" in complaint(name="ut_clat")
-    assert "bundled: clock-step, demo, dense-10, dense-10-anchored," in complaint(name="zzz")
+    assert "bundled: ajlatt, ajlatt-ablation, ajlatt-c," in complaint(name="zzz")
 
 
 def test_a_recording_needs_its_path_and_has_no_more_than_it_holds() -> None:
@@ -252,8 +254,9 @@ def test_the_normative_example_states_what_the_defaults_are() -> None:
     assert data["lost_above_m"] == defaults["lost_above_m"].default
     assert data["origin"] == defaults["origin"].default
     localization = defaults["localization"].default
-    for key in ("kind", "form", "transform", "correlation", "pair_timeout_s"):
+    for key in ("kind", "form", "correlation", "pair_timeout_s"):
         assert data["localization"][key] == getattr(localization, key)
+    assert data["localization"]["transform"] == localization.settings().transform
     assert math.isclose(data["robots"][0]["start_sigma"]["heading_rad"], math.radians(2.0), rel_tol=1e-6)
 
 

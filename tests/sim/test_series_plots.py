@@ -10,7 +10,16 @@ import pytest
 from matplotlib.axes import Axes
 
 from sim import plots
-from sim.series_plots import anees_over_time, each_rmse, fleet_anees, fleet_rmse, pooled, rmse_over_time, shortened
+from sim.series_plots import (
+    anees_over_time,
+    each_rmse,
+    fleet_anees,
+    fleet_rmse,
+    pair_distances,
+    pooled,
+    rmse_over_time,
+    shortened,
+)
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -48,6 +57,29 @@ def series(scale: float = 1.0, seconds: int = 20, bound: float | None = 0.5) -> 
         found["bound_position_rmse_m"] = {name: [bound] * seconds for name in robots}
         found["bound_target_position_rmse_m"] = {"t1": [bound] * seconds}
     return found
+
+
+def test_pairs_are_drawn_with_the_nearest_of_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[np.ndarray[Any, Any]] = []
+    real = Axes.plot
+
+    def note(self: Axes, *points: Any, **look: Any) -> Any:
+        if len(points[0]):
+            drawn.append(np.asarray(points[1]))
+        return real(self, *points, **look)
+
+    monkeypatch.setattr(Axes, "plot", note)
+    t_s = np.arange(3.0)
+    places = np.zeros((3, 3, 2))
+    places[:, 1, 0], places[:, 2, 0] = [3.0, 4.0, 9.0], [10.0, 10.0, 10.0]
+    path = pair_distances(t_s, places, 2.0, tmp_path / "distances.png")
+    assert path.read_bytes().startswith(PNG)
+    assert sorted(map(tuple, drawn[0].T)) == [(3.0, 4.0, 9.0), (7.0, 6.0, 1.0), (10.0, 10.0, 10.0)]
+    np.testing.assert_array_equal(drawn[1], [3.0, 4.0, 1.0])
+    swarm = np.random.default_rng(1).normal(size=(3, 20, 2))
+    pair_distances(t_s, swarm, 2.0, tmp_path / "swarm.png")
+    assert drawn[2].shape == (3, plots.MAX_PAIRS)
+    np.testing.assert_array_equal(drawn[3], drawn[2].min(axis=1))
 
 
 def test_pooling_takes_what_there_is() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from sim.metrics import StateTrace, TrialTrace
 from sim.scenario_file import load
+from sim.sight import View, views
 from sim.store import FILE, load_trace, save_trace
 from sim.trial import run_trial
 
@@ -39,6 +40,17 @@ def test_a_trial_comes_back_as_it_was(tmp_path: Path, with_bound: bool) -> None:
         assert stored.trace.bound is not None
         for name, state in states.items():
             assert_equal(stored.trace.bound[group][name], state)
+
+
+def test_fields_of_view_come_back(tmp_path: Path) -> None:
+    found = views(load("dense-6"))
+    assert found["r03"] == [View(0.0, 0.0, 0.0, 1.0471976, 2.0, 15.0)]
+    assert views(load("ut-clat")) == {}
+    state = StateTrace(np.zeros((2, 3)), np.ones((2, 3)), np.tile(np.eye(3), (2, 1, 1)), (2,))
+    save_trace(tmp_path, TrialTrace(np.arange(2.0), {"r03": state}, {}), [], {}, views=found)
+    stored = load_trace(tmp_path)
+    assert stored is not None
+    assert stored.views == found
 
 
 def test_a_position_of_three_components_comes_back(tmp_path: Path) -> None:

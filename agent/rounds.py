@@ -1,0 +1,94 @@
+"""Rounds: when they open and end, and what neighbours have told.
+
+At each whole multiple of the period since the start of the run every robot tells its neighbours what it believes. A
+round ends when all have told who told lately, or `wait_ns` after its instant; who comes later than that counts in the
+next one, with what it told carried there (`agent.estimation.jlatt`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from agent.events import LinkChange
+from agent.peer_tables import remember
+from agent.settings import RoundSettings
+from network.messages import RoundReport, RoundStage
+
+PRESENT_ROUNDS = 2
+"""Who was silent for so many rounds is not waited for."""
+
+OLDEST_ROUNDS = 8
+"""What is older is not used any more: nobody knows how its sender has moved since."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Told:
+    """A report and the instant it is of, on the own clock."""
+
+    peer: str
+    t_ns: int
+    report: RoundReport
+
+
+class Neighbours:
+    """The newest report of each peer and stage."""
+
+    def __init__(self, settings: RoundSettings) -> None:
+        self._settings = settings
+        self._lives: dict[str, tuple[int, int]] = {}
+        self._told: dict[RoundStage, dict[str, Told]] = {stage: {} for stage in RoundStage}
+
+    def hear(self, told: Told) -> bool:
+        """Keep a report; False if a newer one is known."""
+        table = self._told[told.report.stage]
+        last = table.get(told.peer)
+        if last is not None and last.t_ns >= told.t_ns:
+            return False
+        remember(table, told.peer, told)
+        return True
+
+    def link_changed(self, event: LinkChange) -> bool:
+        """Forget what a former life of a peer has told; whether there was one."""
+        life = event.incarnation, event.boot_id
+        if not event.up or self._lives.get(event.peer) == life:
+            return False
+        remember(self._lives, event.peer, life)
+        for table in self._told.values():
+            table.pop(event.peer, None)
+        return True
+
+    def newest(self, stage: RoundStage, t_ns: int) -> list[Told]:
+        """What is not too old at `t_ns`, in ascending order of peers."""
+        oldest = t_ns - OLDEST_ROUNDS * self._settings.period_ns
+        return [told for _, told in sorted(self._told[stage].items()) if told.t_ns >= oldest]
+
+    def all_told(self, stage: RoundStage, t_ns: int) -> bool:
+        """Whether everybody who told lately has told of the round at `t_ns`; nobody else is waited for."""
+        near = t_ns - self._settings.period_ns // 2
+        lately = t_ns - PRESENT_ROUNDS * self._settings.period_ns
+        stamps = [told.t_ns for told in self._told[stage].values() if told.t_ns >= lately]
+        return bool(stamps) and all(stamp >= near for stamp in stamps)
+
+
+class RoundClock:
+    """Instants of rounds. One at a time is open."""
+
+    def __init__(self, settings: RoundSettings, start_ns: int) -> None:
+        self._settings = settings
+        self.next_ns = self._after(start_ns - 1)
+
+    def _after(self, t_ns: int) -> int:
+        """The first instant of a round later than `t_ns`."""
+        period, anchor = self._settings.period_ns, self._settings.anchor_ns
+        return anchor + ((t_ns - anchor) // period + 1) * period
+
+    def due(self, t_ns: int) -> int | None:
+        """The newest round not later than `t_ns`, if it has not been opened."""
+        newest = self._after(t_ns) - self._settings.period_ns
+        return newest if newest >= self.next_ns else None
+
+    def open(self, t_ns: int) -> int:
+        """Open the round at `t_ns`, which is due; how many have been left out before it."""
+        skipped = (t_ns - self.next_ns) // self._settings.period_ns
+        self.next_ns = t_ns + self._settings.period_ns
+        return skipped
