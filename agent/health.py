@@ -124,6 +124,10 @@ class Health:
         if inconsistent or peer in self._records:
             self._record(peer).refusing = inconsistent
 
+    def trusts(self, peer: str) -> bool:
+        """Whether a peer is not quarantined; nobody is where there are no verdicts."""
+        return not self._settings.enabled or peer not in self._records or not self._records[peer].quarantined
+
     @property
     def own_suspect(self) -> bool:
         """Whether all peers met often enough look wrong, two at least."""

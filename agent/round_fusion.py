@@ -193,8 +193,9 @@ class RoundFusion:
         told: dict[str, Told],
     ) -> None:
         """Use what all believe of each target at `t_ns`, and where all place it."""
+        trusted = {peer: item for peer, item in told.items() if self._health.trusts(peer)}
         for target in self._settings.tracked:
-            self._correct(target.id, tracks, t_ns, corrections.get(target.id), seen.get(target.id), told)
+            self._correct(target.id, tracks, t_ns, corrections.get(target.id), seen.get(target.id), trusted)
         for peer, item in told.items():
             self._used[peer] = item.t_ns
 

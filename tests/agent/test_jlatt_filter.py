@@ -169,6 +169,19 @@ def test_a_sensor_s_noise_counts_as_new_once() -> None:
     assert after(3) > 0.0
 
 
+def test_who_is_quarantined_tells_nothing_of_targets_either() -> None:
+    sender = Agent(settings_of("r2", mean=np.array([0.0, 2.0, 0.0])))
+    told_by(sender, Tick(0))
+    (report,) = told_by(sender, drive(1, 0.0), sight(1, "target:t1", (8.0, -0.1)), Tick(NS))
+    agent = Agent(settings_of())
+    told_by(agent, Tick(0), Tick(ROUND.wait_ns), LinkChange(0, "r2", True, 1, 1))
+    for k in range(8):
+        agent.health.usable("r2", k, 50.0, own_observed=True)
+    assert not agent.health.trusts("r2") and agent.health.trusts("r3")
+    told_by(agent, drive(1, 0.0), heard(report, NS), Tick(NS), Tick(NS + ROUND.wait_ns))
+    assert agent.counters["round.closed"] == 2 and agent.counters["round.used_corrections"] == 0
+
+
 def test_a_detection_of_somebody_unheard_is_no_use_and_counted() -> None:
     agent = Agent(settings_of())
     told_by(agent, Tick(0), drive(1), sight(1, "r2", (5.0, 0.0)), Tick(NS), Tick(NS + ROUND.wait_ns))

@@ -18,11 +18,12 @@ FORMS = {
     "joint": ["localization.form=joint"],
     "split_joint": ["localization.form=split_joint"],
     "replica": ["localization.kind=replica"],
+    "jlatt": ["localization.kind=jlatt"],
 }
 """`--set` overrides by form."""
 
-KINDS = frozenset(range(1, 10))
-"""Every kind of message of the wire format."""
+KINDS = frozenset((*range(1, 10), 11))
+"""Every kind of message of the wire format but the notice to a robot that is there twice."""
 
 
 def fleet(form: str, duration_s: float, clock_sigma_s: float = 0.005) -> Scenario:
