@@ -211,9 +211,12 @@ class JlattFilter:
         if self._open is not None:
             return
         due_ns = self._clock.due(until_ns)
-        # What odometry has not reached yet, nothing can be told of; what is past, nobody waits for any more.
-        if due_ns is not None and self.t_ns >= due_ns - self._settings.lateness.tolerance_ns:
-            self._counters["round.skipped"] += self._clock.open(due_ns)
+        if due_ns is None:
+            return
+        # What is past, nobody waits for any more; of what odometry has not reached yet, nothing can be told.
+        self._counters["round.skipped"] += self._clock.leave_out(due_ns)
+        if self.t_ns >= due_ns - self._settings.lateness.tolerance_ns:
+            self._clock.open(due_ns)
             self._begin(due_ns, effects)
 
     def _begin(self, t_ns: int, effects: list[Effect]) -> None:

@@ -87,8 +87,14 @@ class RoundClock:
         newest = self._after(t_ns) - self._settings.period_ns
         return newest if newest >= self.next_ns else None
 
+    def leave_out(self, t_ns: int) -> int:
+        """Rounds before the one at `t_ns`, which is due, are over; how many there are."""
+        skipped = (t_ns - self.next_ns) // self._settings.period_ns
+        self.next_ns = t_ns
+        return skipped
+
     def open(self, t_ns: int) -> int:
         """Open the round at `t_ns`, which is due; how many have been left out before it."""
-        skipped = (t_ns - self.next_ns) // self._settings.period_ns
-        self.next_ns = t_ns + self._settings.period_ns
+        skipped = self.leave_out(t_ns)
+        self.next_ns += self._settings.period_ns
         return skipped

@@ -13,6 +13,7 @@ says what was broken, by whom, when, and how to see it again.
     information   without information a pose gets no surer: motion keeps the volume of its uncertainty and adds noise
     split         private and shared parts of a covariance are positive semi-definite and add up to it
     counters      no counter falls, and there are only so many
+    deadlines     no robot waits for an instant that is past, again and again
 """
 
 from __future__ import annotations
@@ -75,6 +76,12 @@ class _Life:
     learnt: int = 0
     volume: float = 0.0
     form: object = None
+    due_ns: int = -(2**62)
+    at_once: int = 0
+
+
+SPIN_NS, MOST_AT_ONCE = 1_000, 100
+"""A robot whose timers go off so often within so little time each waits for what does not come."""
 
 
 class InvariantChecker:
@@ -91,7 +98,7 @@ class InvariantChecker:
         life = self._lives.get(node.robot)
         if life is None or life.node is not node:
             life = self._lives[node.robot] = _Life(node)
-        for rule, wrong in self._wrong(life, out):
+        for rule, wrong in (*_spinning(life, t_ns, event), *self._wrong(life, out)):
             raise InvariantBreach(rule, node.robot, self._seed, t_ns, event, wrong, self._replay)
         self.checked += 1
 
@@ -112,6 +119,15 @@ class InvariantChecker:
         yield from _counters(life)
         if out is not None:
             yield from _sent(life, out)
+
+
+def _spinning(life: _Life, t_ns: int, event: str) -> Iterable[tuple[str, str]]:
+    if event != "a timer":
+        return
+    life.at_once = life.at_once + 1 if t_ns - life.due_ns <= SPIN_NS else 0
+    life.due_ns = t_ns
+    if life.at_once > MOST_AT_ONCE:
+        yield "deadlines", f"{life.at_once} timers in a row went off at once"
 
 
 def _covariances(estimate: Estimate) -> Iterable[tuple[str, str]]:

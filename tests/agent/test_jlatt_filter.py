@@ -212,6 +212,16 @@ def test_odometry_that_is_silent_skips_rounds_and_does_not_spin() -> None:
     assert agent.counters["round.skipped"] == 6
 
 
+def test_who_begins_again_long_after_its_survey_does_not_spin() -> None:
+    """Its belief is of long ago until odometry comes, and rounds of that time are over."""
+    agent = Agent(settings_of())
+    told_by(agent, Tick(10 * NS))
+    assert agent.next_deadline_ns() > 10 * NS
+    assert agent.counters["round.skipped"] == 10
+    (report,) = told_by(agent, replace(drive(11), t0_ns=0), Tick(11 * NS))
+    assert report.stage is RoundStage.PRIOR
+
+
 def test_robots_of_other_models_see_each_other() -> None:
     ground = Agent(settings_of())
     cov = np.diag([0.01, 0.01, 0.04, 1e-4])

@@ -45,7 +45,15 @@ def test_nothing_is_broken_in_any_form(form: str) -> None:
     assert checked(scenario, 2) > 100
 
 
-@pytest.mark.parametrize("name", ["ut-clat-quadrotors", "dense-6", "demo"])
+@pytest.mark.parametrize("intensity", ["field", "storm"])
+def test_nothing_is_broken_in_rounds(intensity: str) -> None:
+    scenario = load("fault-plan", ["localization.kind=jlatt", f"fault_plan.intensity={intensity}"])
+    # In the first of them a robot begins again without its state, long after its survey.
+    for seed in (14, *SEEDS[:2]):
+        assert checked(scenario, seed) > 1000
+
+
+@pytest.mark.parametrize("name", ["ut-clat-quadrotors", "dense-6", "demo", "ajlatt"])
 def test_nothing_is_broken_in_other_worlds(name: str) -> None:
     assert checked(load(name, ["duration_s=20", "window_s=[0, 20]"]), 1) > 100
 
@@ -92,6 +100,13 @@ def altered(change: Callable[[Estimate], Estimate]) -> Callable[..., Any]:
 )
 def test_a_covariance_that_is_none(monkeypatch: pytest.MonkeyPatch, change: Callable[[Estimate], Estimate]) -> None:
     assert broken(monkeypatch, Agent, "estimate", altered(change), "auto") == "covariance"
+
+
+def test_a_deadline_that_does_not_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stuck(real: Callable[..., Any], call: int, self: Agent) -> int:
+        return real(self) if call < 200 else self.now_ns
+
+    assert broken(monkeypatch, Agent, "next_deadline_ns", stuck, "auto") == "deadlines"
 
 
 def test_time_that_goes_back(monkeypatch: pytest.MonkeyPatch) -> None:
