@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from deploy.cli import main as cofix
+from benchmarks.runs import run
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,27 +113,13 @@ def play(regime: Regime, seed: int, share: float, folder: Path) -> dict[tuple[st
     out = folder / f"{regime.scenario}-{seed}-{trials}"
     team = folder / f"{out.name}-replica"
     arguments = ["montecarlo", regime.scenario, "--trials", str(trials), "--seed", str(seed), "--bound"]
-    _run([*arguments, "--vary", "localization.form=" + ",".join(FORMS)], out)
-    _run([*arguments, "--set", "localization.kind=replica"], team)
+    run([*arguments, "--vary", "localization.form=" + ",".join(FORMS)], out)
+    run([*arguments, "--set", "localization.kind=replica"], team)
     found = {form: out / f"form={form}" for form in FORMS} | {"replica": team}
     return {
         (regime.scenario, method): row(json.loads((found[method] / "summary.json").read_text()), regime.fixed)
         for method in METHODS
     }
-
-
-def _run(arguments: list[str], out: Path) -> None:
-    """One command whose results are in `out`, going on where it was. Raises `RuntimeError` if it fails."""
-    arguments = [*arguments, "--out", str(out)]
-    if out.exists():
-        arguments.append("--resume")
-    stdout, sys.stdout = sys.stdout, sys.stderr
-    try:
-        status = cofix(arguments)
-    finally:
-        sys.stdout = stdout
-    if status != 0:
-        raise RuntimeError(f"cofix {' '.join(arguments)} ended with status {status}")
 
 
 def main(arguments: list[str] | None = None) -> int:

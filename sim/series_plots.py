@@ -157,8 +157,11 @@ def _bound_line(axes: Any, index: int | None, t_s: list[float], values: Array) -
     axes.plot(t_s, values, color=GREY if index is None else colour(index), ls=":", lw=1.2)
 
 
-def fleet_rmse(runs: Runs, path: Path) -> Path:
-    """Position RMSE over time of each run's fleet, and of its tracks; the centralized filter dotted."""
+def fleet_rmse(runs: Runs, path: Path, *, narrow: bool = False) -> Path:
+    """Position RMSE over time of each run's fleet, and of its tracks; the centralized filter dotted.
+
+    With `narrow` the axes of errors are logarithmic, so that runs of very different errors fit into one picture.
+    """
     tracked = any(_tracks(series) for _, series in runs)
     own, of_targets = _bounds(runs, "bound_position_rmse_m"), _bounds(runs, "bound_target_position_rmse_m")
     end_s = _end(runs)
@@ -175,7 +178,10 @@ def fleet_rmse(runs: Runs, path: Path) -> Path:
         if tracked:
             panels[1].set_ylabel("tracks, RMSE [m]")
         for axes in panels:
-            axes.set_ylim(bottom=0.0)
+            if narrow:
+                logarithmic(axes, between=True)
+            else:
+                axes.set_ylim(bottom=0.0)
             axes.set_xlim(0.0, end_s)
         panels[-1].set_xlabel("time [s]")
         _legend(figure, panels[0], runs, bool(own))

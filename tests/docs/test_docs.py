@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import active
 from deploy.cli import parser
 from sim.scenario_file import bundled, load
 from tests.sizes import THOROUGH
@@ -44,6 +45,13 @@ def test_commands_are_understood(document: str, line: str) -> None:
         load(options.scenario, options.set)
 
 
+def test_commands_that_compare_planners_are_understood() -> None:
+    told = [line for path in DOCUMENTS for line in re.findall(r"python -m benchmarks\.active(.*)", path.read_text())]
+    assert len(told) >= 3
+    for line in told:
+        active.parser().parse_args(shlex.split(re.split(r"  #|`", line)[0]))
+
+
 def test_the_readme_shows_commands() -> None:
     assert len(commands(ROOT / "README.md")) >= 8
 
@@ -72,11 +80,18 @@ def test_a_readme_run_works_as_written_but_shorter(tmp_path: Path) -> None:
         assert (run / name).exists()
 
 
+PROMISES = (
+    ("What holds then, in numbers", "After a restart a robot goes on"),
+    ("What is promised of planners and rounds", "## Measured"),
+)
+"""Words before and after what README promises."""
+
+
 def promises() -> list[str]:
-    """What README promises under faults, item by item."""
+    """What README promises under faults and of robots that choose their motion, item by item."""
     text = (ROOT / "README.md").read_text()
-    begin, end = text.index("What holds then, in numbers"), text.index("After a restart a robot goes on")
-    return re.findall(r"^- .*(?:\n  .*)*", text[begin:end], re.MULTILINE)
+    parts = [text[text.index(begin) : text.index(end)] for begin, end in PROMISES]
+    return [item for part in parts for item in re.findall(r"^- .*(?:\n  .*)*", part, re.MULTILINE)]
 
 
 @pytest.mark.parametrize("promise", promises(), ids=lambda promise: promise[2:30])

@@ -15,6 +15,7 @@ from sim.metrics import nees
 from sim.scenario import Scenario
 from sim.scenario_file import load
 from sim.trial import open_world, run_trial
+from tests.sizes import sized
 
 SHORT = ["duration_s=120", "window_s=[30, 120]"]
 
@@ -156,3 +157,36 @@ def test_a_target_nobody_knew_of_is_in_the_bound_once_somebody_has_seen_it() -> 
     started = np.isfinite(best.mean).all(axis=1)
     np.testing.assert_allclose(best.mean[started][0], own.mean[started][0], atol=1e-9)
     np.testing.assert_allclose(best.cov[started][0], own.cov[started][0], atol=1e-9)
+
+
+CLOSED = ["duration_s=30", "window_s=[0, 30]"]
+
+
+@pytest.fixture(scope="module")
+def closed() -> list[TrialResult]:
+    """Trials of robots that choose their motion by what they believe."""
+    return [run_trial(load("ajlatt-c", CLOSED), seed, with_bound=True) for seed in CLOSED_SEEDS]
+
+
+CLOSED_SEEDS = range(1, 1 + sized(2, 10))
+
+
+def test_the_bound_looks_on_and_moves_nobody(closed: list[TrialResult]) -> None:
+    plain = run_trial(load("ajlatt-c", CLOSED), CLOSED_SEEDS[0]).trace
+    for robot, state in plain.robots.items():
+        np.testing.assert_array_equal(state.truth, closed[0].trace.robots[robot].truth)
+        np.testing.assert_array_equal(state.mean, closed[0].trace.robots[robot].mean)
+
+
+def test_the_bound_knows_where_robots_went_that_chose_it(closed: list[TrialResult]) -> None:
+    """It errs less than the fleet, and no more than it says: mean NEES of whole trials, which are independent."""
+    own, bound, ratios = [], [], []
+    for trial in closed:
+        assert trial.trace.bound is not None
+        for robot, state in trial.trace.robots.items():
+            best = trial.trace.bound["robots"][robot]
+            own.append(np.mean(np.sum((state.mean - state.truth)[:, :2] ** 2, axis=1)))
+            bound.append(np.mean(np.sum((best.mean - best.truth)[:, :2] ** 2, axis=1)))
+            ratios.append(np.mean(nees(best)))
+    assert np.mean(bound) < np.mean(own), f"seeds {CLOSED_SEEDS}"
+    assert 0.4 < np.mean(ratios) < 1.6, f"seeds {CLOSED_SEEDS}"
