@@ -115,25 +115,34 @@ def _read(run_dir: Path) -> tuple[Row, dict[str, Any]]:
     return row(summary, rmse), summary["series"]
 
 
-HEAD = (
-    "lost | target [m] | median | ANEES | centralized (ANEES) | robots [m] | median | ANEES | centralized (ANEES) "
-    "| collisions | nearest [m] | connected | seen | plan [us] |"
-)
-
-
 def table(rows: dict[str, Row], what: str) -> str:
-    """All rows in Markdown, `what` they are of at the head of the first column."""
-    lines = [f"| {what} | {HEAD}", "|---" * 15 + "|"]
-    for name, found in rows.items():
-        bounds = ["" if b is None else f"{b[0]:.2f} ({b[1]:.2f})" for b in (found.target_bound, found.robots_bound)]
-        lines.append(
-            f"| {name} | {found.lost} of {found.trials} "
-            f"| {found.target_m:.2f} | {found.target_median_m:.2f} | {found.target_anees:.2f} | {bounds[0]} "
-            f"| {found.robots_m:.2f} | {found.robots_median_m:.2f} | {found.robots_anees:.2f} | {bounds[1]} "
-            f"| {found.collisions:.1f} | {found.min_distance_m:.2f} | {found.connected:.2f} | {found.seen:.2f} "
-            f"| {found.plan_us:.0f} |"
-        )
-    return "\n".join(lines)
+    """All rows in Markdown, `what` they are of at the head of the first column; of the centralized filter if any is."""
+    beside = any(found.target_bound is not None for found in rows.values())
+    cells = [_cells(name, found, beside) for name, found in rows.items()]
+    error = ("median", "ANEES", *(("centralized (ANEES)",) if beside else ()))
+    head = (what, "lost", "target [m]", *error, "robots [m]", *error)
+    head += ("collisions", "nearest [m]", "connected", "seen", "plan [us]")
+    return "\n".join("| " + " | ".join(line) + " |" for line in (head, ("---",) * len(head), *cells))
+
+
+def _cells(name: str, found: Row, beside: bool) -> tuple[str, ...]:
+    """A row as it is printed, with the centralized filter or without."""
+
+    def error(mean: float, median: float, anees: float, bound: tuple[float, float] | None) -> tuple[str, ...]:
+        best = "" if bound is None else f"{bound[0]:.2f} ({bound[1]:.2f})"
+        return f"{mean:.2f}", f"{median:.2f}", f"{anees:.2f}", *((best,) if beside else ())
+
+    return (
+        name,
+        f"{found.lost} of {found.trials}",
+        *error(found.target_m, found.target_median_m, found.target_anees, found.target_bound),
+        *error(found.robots_m, found.robots_median_m, found.robots_anees, found.robots_bound),
+        f"{found.collisions:.1f}",
+        f"{found.min_distance_m:.2f}",
+        f"{found.connected:.2f}",
+        f"{found.seen:.2f}",
+        f"{found.plan_us:.0f}",
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +181,7 @@ def curve(plan: Plan) -> dict[str, Row]:
     """Figures of `ajlatt` over links that lose and delay messages."""
     case, period_s = CASES["ajlatt"], load("ajlatt").round.period_s
     found = {f"{100.0 * loss:.0f} % lost": f"links.loss={loss}" for loss in LOSSES}
-    found |= {f"{rounds} rounds late": f"links.delay_s={rounds * period_s}" for rounds in DELAYS}
+    found |= {f"rounds late: {rounds}": f"links.delay_s={rounds * period_s}" for rounds in DELAYS}
     rows = {}
     for name, override in found.items():
         changed = Case(case.scenario, (*case.overrides, override))
