@@ -12,12 +12,17 @@ from numpy.typing import NDArray
 from agent.course import Course, Moment
 from agent.estimation.motion import StateLayout
 from agent.estimation.observation import RelativeModel
+from agent.estimation.unscented import Transform
 from agent.joint_tracks import JointState, RelayedTrack
 from agent.settings import AgentSettings
 from agent.tracks import TrackRules
 from network.messages import Belief, TargetBelief
 
 Array = NDArray[np.float64]
+
+
+FOLLOWED_ROUNDS = 10
+"""A target of which something was learnt within so many rounds is followed."""
 
 
 @dataclass(slots=True)
@@ -65,13 +70,23 @@ class RoundTracks:
 
     def advance(self, t_ns: int) -> None:
         """Move all tracks to the later instant `t_ns`; those that are over by then end."""
-        transform = self._settings.localization.transform
         for target, track in list(self._tracks.items()):
             now = track.course.newest
+            transform = self._transform(track)
             moved = self._motions[target].drift(now.mean, now.cov, (t_ns - now.t_ns) * 1e-9, transform)
             track.course.advance(t_ns, moved)
             self._end_if_over(target, track)
         self._t_ns = t_ns
+
+    def _transform(self, track: _Track) -> Transform:
+        """Of a target that nobody has seen lately, a heading that is off stays off: its way is no straight line then.
+
+        One that is followed is corrected before that shows.
+        """
+        lately_ns = FOLLOWED_ROUNDS * self._settings.round.period_ns
+        if track.course.newest.t_ns - track.learnt_ns > lately_ns:
+            return "unscented"
+        return self._settings.localization.transform
 
     def _end_if_over(self, target: str, track: _Track) -> None:
         now = track.course.newest
