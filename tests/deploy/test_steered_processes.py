@@ -68,7 +68,7 @@ for_s = 9.0
 kind = "crash"
 robot = "r3"
 at_s = 10.0
-for_s = 6.0
+for_s = 3.0
 """
 
 COMMAND = (sys.executable, "-P", "-m", "deploy.cli", "run", "steered.toml")
