@@ -265,6 +265,8 @@ class Agent:
         elif event.of == self.settings.robot:
             self.counters["observation.of_self"] += 1
         else:
+            if self._pilot is not None:
+                self._pilot.saw(event.of, event)
             self._queue(Item(event.t_meas_ns, Phase.PAIR, event.of, event))
 
     def _receive(self, event: Received, effects: list[Effect]) -> None:

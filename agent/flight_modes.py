@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+MS = 1_000_000
+
 COPTERS = (
     dialect.MAV_TYPE_QUADROTOR,
     dialect.MAV_TYPE_COAXIAL,
@@ -55,12 +57,14 @@ class Controls:
     steered       the mode in which it obeys velocity set-points
     by_hand       the mode it starts in
     stream_first  whether set-points have to arrive for a while before it enters that mode
+    setpoint_ns   interval of set-points that it gets, several times shorter than it holds one
     """
 
     modes: dict[str, int]
     steered: str
     by_hand: str
     stream_first: bool
+    setpoint_ns: int
 
     def name(self, custom_mode: int) -> str:
         """A mode for people."""
@@ -74,9 +78,17 @@ class Controls:
         return flag, float(number), 0.0
 
 
-ARDUCOPTER = Controls(_ARDUCOPTER, "GUIDED", "STABILIZE", stream_first=False)
-ARDUROVER = Controls(_ARDUROVER, "GUIDED", "MANUAL", stream_first=False)
-PX4 = Controls({name: main << 16 | sub << 24 for name, (main, sub) in _PX4.items()}, "OFFBOARD", "POSCTL", True)
+ARDUCOPTER = Controls(_ARDUCOPTER, "GUIDED", "STABILIZE", stream_first=False, setpoint_ns=250 * MS)
+ARDUROVER = Controls(_ARDUROVER, "GUIDED", "MANUAL", stream_first=False, setpoint_ns=250 * MS)
+"""They hold a set-point for 3 s."""
+PX4 = Controls(
+    {name: main << 16 | sub << 24 for name, (main, sub) in _PX4.items()},
+    "OFFBOARD",
+    "POSCTL",
+    stream_first=True,
+    setpoint_ns=100 * MS,
+)
+"""It wants more than 2 Hz, and leaves OFFBOARD after a second without."""
 
 
 def controls(autopilot: int, vehicle_type: int) -> Controls | None:

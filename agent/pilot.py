@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from agent.cooperative_filter import CooperativeFilter
 from agent.effects import Broadcast, Effect, Estimate, Steer
 from agent.estimation.motion import STATES
-from agent.events import LinkChange, Received
+from agent.events import LinkChange, Observation, Received
+from agent.lookout import Lookout
 from agent.pair_clock import PairClocks
 from agent.planning.choice import build_planner
 from agent.planning.situation import Member, Situation, TargetView
@@ -42,6 +43,7 @@ class Pilot:
         self._clocks = PairClocks(settings)
         self._clock = RoundClock(settings.round, settings.start_ns)
         self._neighbours = Neighbours(settings.round)
+        self._lookout = Lookout(settings)
         self._lean = settings.round.lean and settings.localization.kind == "jlatt"
         self._open_ns: int | None = None
         self._simple_until = 0
@@ -57,6 +59,10 @@ class Pilot:
             t_ns = header.t_meas_ns - self._clocks.offset_ns(event)
             if t_ns <= event.t_ns + self._settings.round.period_ns:
                 self._neighbours.hear(Told(header.source, t_ns, body))
+
+    def saw(self, peer: str, event: Observation) -> None:
+        """An own measurement of a peer."""
+        self._lookout.saw(peer, event)
 
     def link_changed(self, event: LinkChange) -> None:
         """A peer has appeared, perhaps in a new life, or fallen silent."""
@@ -142,11 +148,13 @@ class Pilot:
             for told in self._neighbours.newest(stage, t_ns):
                 if told.peer not in newest or told.t_ns >= newest[told.peer].t_ns:
                     newest[told.peer] = told
-        others = (self._member(told.peer, told.report, t_ns - told.t_ns) for _, told in sorted(newest.items()))
+        self._lookout.place(estimate)
+        found = [self._member(told.peer, told.report, t_ns - told.t_ns) for told in newest.values()]
+        others = [other for other in found if other is not None] + self._lookout.members(t_ns, set(newest))
         me = self._member(self._settings.robot, own, 0)
         assert me is not None
         dt_s = self._settings.round.period_ns * 1e-9
-        return Situation(index, dt_s, me, tuple(other for other in others if other is not None))
+        return Situation(index, dt_s, me, tuple(sorted(others, key=lambda other: other.robot)))
 
     def _member(self, robot: str, report: RoundReport, age_ns: int) -> Member | None:
         """A robot as a planner sees it; None if it has no heading."""

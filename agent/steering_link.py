@@ -27,8 +27,8 @@ from agent.requests import command_long
 
 MS = 1_000_000
 NS = 1_000_000_000
-SETPOINT_INTERVAL_NS = NS // 10
-"""PX4 wants more than 2 Hz, and leaves OFFBOARD after a second without; ArduPilot stops after three."""
+UNKNOWN_INTERVAL_NS = NS // 10
+"""Of a vehicle that is not known yet it is looked so often whether it may be steered."""
 STOP_NS = NS
 STREAM_FIRST_NS = 3 * NS // 2
 """PX4 enters OFFBOARD after a second of set-points."""
@@ -158,11 +158,12 @@ class SteeringLink:
     def due(self, now_ns: int, vehicle: tuple[int, int]) -> list[Any]:
         """Messages due by now for `vehicle` (system, component)."""
         out = []
+        interval_ns = UNKNOWN_INTERVAL_NS if self._controls is None else self._controls.setpoint_ns
         # A clock that was set back a little must not make a gap.
-        early = self._next_ns - now_ns > SETPOINT_INTERVAL_NS
+        early = self._next_ns - now_ns > interval_ns
         if self._steer is not None and (early or now_ns >= self._setpoint_ns()):
             motion = self._motion(now_ns, self._steer)
-            self._next_ns = now_ns + SETPOINT_INTERVAL_NS
+            self._next_ns = now_ns + interval_ns
             if motion is not None:
                 self._streaming_since_ns = now_ns if self._streaming_since_ns is None else self._streaming_since_ns
                 out.append(self._setpoint(now_ns, vehicle, *motion))

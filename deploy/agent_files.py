@@ -15,10 +15,14 @@ from sim.host import HostPlan
 from sim.scenario import RobotPart, Scenario, sensor_kind
 from sim.world import World
 
-# What the scheduling of one computer costs, in wall time: data of an instant are waited for so long, and stamps
-# that passed through TIMESYNC are off by so much.
+# What the scheduling of one computer costs, in wall time: data of an instant are waited for so long, stamps that
+# passed through TIMESYNC are off by so much, a robot's report of a round comes so late, and its odometry at the latest.
 SETTLE_WALL_S = 0.015
 STAMP_WALL_S = 0.0015
+ROUND_WALL_S = 0.03
+ODOMETRY_WALL_S = 0.3
+ROUND_SHARE = 0.45
+"""Of a round's period it waits no longer, twice: after that the next one begins."""
 LEASE_MS, LEASE_PER_ROBOT_MS = 1_000, 250
 """Many processes that start on one computer are slow at first: links that are given up too soon are opened again and
 again, and with forty of them that takes all the time there is."""
@@ -54,6 +58,10 @@ def agent_file(
     lateness = tables["lateness"]
     lateness["settle_s"] = max(lateness["settle_s"], SETTLE_WALL_S * speed)
     lateness["tolerance_s"] = max(lateness["tolerance_s"], STAMP_WALL_S * speed)
+    lateness["odometry_wait_s"] = max(lateness["odometry_wait_s"], ODOMETRY_WALL_S * speed)
+    rounds = tables["round"]
+    longest_s = max(rounds["wait_s"], ROUND_SHARE * rounds["period_s"])
+    rounds["wait_s"] = min(max(rounds["wait_s"], lateness["settle_s"] + ROUND_WALL_S * speed), longest_s)
     fix = autopilot_fix(robot)
     mavlink: dict[str, Any] = {
         "endpoint": f"udpin:127.0.0.1:{plan.mavlink_ports[robot.id]}",
@@ -75,6 +83,7 @@ def agent_file(
     return tables | {
         "clock": {"source": "run", "speed": speed},
         "lateness": lateness,
+        "round": rounds,
         "zenoh": {
             "listen": endpoints[robot.id],
             "peers": [{"id": name, "endpoints": value} for name, value in endpoints.items() if name != robot.id],

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 LIVE_TEXT = ("agent", "process", "neighbours")
 LIVE_NUMBERS = ("x [m]", "y [m]", "sigma [m]", "contacts", "rejected", "lag [s]")
+BY_ROUNDS = {"contacts": "rounds"}
+"""Columns of a fleet that localizes itself by rounds: there are no contacts of pairs."""
 
 
 class Shown:
@@ -168,6 +170,7 @@ class LiveTable:
         for name, running in sorted(launcher.members.items()):
             notes += [f"{name}: {reason}" for reason in running.status.get("health", {}).get("reasons", [])]
             notes += [f"{name}: hears {peer} and is not heard by it" for peer in running.status.get("unheard_by", [])]
+            notes += [f"{name}: {reason}" for reason in stillness(running.status, alone=len(launcher.members) <= 2)]
         table = Table(
             title=title,
             title_justify="left",
@@ -176,14 +179,35 @@ class LiveTable:
         )
         for name in LIVE_TEXT:
             table.add_column(escape(name))
+        renamed = BY_ROUNDS if self._scenario.localization.kind == "jlatt" else {}
         for name in LIVE_NUMBERS:
-            table.add_column(escape(name), justify="right")
+            table.add_column(escape(renamed.get(name, name)), justify="right")
         for robot in self._scenario.robots:
             member = launcher.members.get(robot.id)
             if member is None:
                 continue
             table.add_row(robot.id, *_cells(member.exit_code, member.status))
         return table
+
+
+def stillness(status: dict[str, Any], *, alone: bool) -> list[str]:
+    """Why a robot that chooses its motion does not move, or plans with less than it could; nothing for another one.
+
+    `alone`: there is nobody that it could hear.
+    """
+    steering = status.get("steering")
+    if steering is None or "x_m" not in status:
+        return []
+    autopilot = status.get("autopilot", {})
+    reasons = list(autopilot.get("reasons", []))
+    missing = (autopilot.get("steering") or {}).get("missing")
+    if missing and not reasons:
+        reasons.append(f"does not move: {missing}")
+    if not steering["neighbours"] and not alone:
+        reasons.append("plans alone: no neighbour has told of the last rounds")
+    if steering["kind"] != "random" and not status.get("tracks"):
+        reasons.append("knows of no target: it keeps clear of others, and goes nowhere")
+    return reasons
 
 
 def _cells(exit_code: int | None, status: dict[str, Any]) -> list[str]:
@@ -194,7 +218,10 @@ def _cells(exit_code: int | None, status: dict[str, Any]) -> list[str]:
     if "x_m" not in status:
         return ["waiting" if status.get("missing") else "starting", "; ".join(status.get("missing", [])), *blank[1:]]
     counters = status.get("counters", {})
-    contacts = counters.get("pair.applied_initiator", 0) + counters.get("pair.applied_responder", 0)
+    used = ("pair.applied_initiator", "pair.applied_responder", "round.closed")
+    contacts = str(sum(counters.get(name, 0) for name in used))
+    if counters.get("round.skipped"):
+        contacts += f" ({counters['round.skipped']} skipped)"
     judged = status.get("health", {}).get("peers", {})
     unused = {peer: "quarantined" for peer, found in judged.items() if found["verdict"] == "quarantined"}
     clocks = status.get("clocks", {})
@@ -210,7 +237,7 @@ def _cells(exit_code: int | None, status: dict[str, Any]) -> list[str]:
         f"{status['x_m']:.2f}",
         f"{status['y_m']:.2f}",
         f"{status['sigma_m']:.2f}",
-        str(contacts),
+        contacts,
         str(sum(status.get("rejected", {}).values())),
         f"{status['lag_s']:.2f}",
     ]

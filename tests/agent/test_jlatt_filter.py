@@ -37,9 +37,10 @@ def test_a_team_knows_where_it_and_the_target_are_and_does_not_claim_more(weight
 
 
 def test_nobody_hearing_anybody_is_worse_and_honest() -> None:
-    together, alone = (Team(3, SPLIT, carry=carry).run(STEPS) for carry in (Team.carry, lambda *_: None))
-    assert_honest(alone, limit=1.7)
-    assert together.rmse()[1] < alone.rmse()[1]
+    together = [Team(seed, SPLIT).run(STEPS) for seed in SEEDS]
+    alone = [Team(seed, SPLIT, carry=lambda *_: None).run(STEPS) for seed in SEEDS]
+    assert_honest(*alone, limit=1.7)
+    assert np.mean([team.rmse()[1] for team in together]) < np.mean([team.rmse()[1] for team in alone])
 
 
 @pytest.mark.parametrize("delay", [1, 3])

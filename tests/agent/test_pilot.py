@@ -13,7 +13,7 @@ from agent.pilot import FALLBACK_ROUNDS
 from agent.settings import AgentSettings, LocalizationSettings, PlanningSettings
 from network.messages import Belief, Header, Message, RoundReport, RoundStage, TargetBelief
 from tests.agent.round_team import NS, ROUND
-from tests.agent.test_jlatt_filter import drive, heard, settings_of
+from tests.agent.test_jlatt_filter import drive, heard, settings_of, sight
 
 WAIT = ROUND.wait_ns
 POTENTIAL = PlanningSettings(kind="potential")
@@ -127,3 +127,16 @@ def test_a_report_from_the_future_is_not_waited_by() -> None:
     far = Message(Header("r2", 1, 1, 0, 100 * NS, 0), report(RoundStage.POSTERIOR, (3.0, 0.0)))
     made(agent, LinkChange(0, "r2", True, 1, 1), Tick(0), Received(0, far))
     assert agent.status()["steering"]["neighbours"] == []  # type: ignore[index]
+
+
+def test_who_is_seen_and_not_heard_is_kept_clear_of() -> None:
+    """It stands 3 m ahead, and the target behind it draws the robot on."""
+
+    def speed(*seen: Event) -> float:
+        agent = Agent(planning())
+        made(agent, Tick(0), Tick(2 * WAIT), drive(1), *seen, Tick(NS))
+        (command,) = steers(made(agent, Tick(NS + 2 * WAIT)))
+        return command.velocity_mps[0]
+
+    assert speed(sight(1, "r2", (3.0, 0.0))) < 0.5 * speed()
+    assert speed(sight(1, "r2", (30.0, 0.0))) == speed()

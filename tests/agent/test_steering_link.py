@@ -147,14 +147,14 @@ def test_a_set_point_says_forward_right_down_and_clockwise() -> None:
 
 @pytest.mark.parametrize("flavour", FLAVOURS)
 def test_the_rate_suits_both(flavour: str) -> None:
-    """PX4 wants more than 2 Hz; a slow serial line has to carry it."""
+    """PX4 wants more than 2 Hz, ArduPilot holds one for 3 s; a slow serial line has to carry it."""
     cable = Cable(flavour, mode=HANDED_OVER[flavour])
     cable.drive(1.5, AHEAD)
     begun = cable.now_ns
     cable.drive(5.0, AHEAD)
     times = [t for t, _ in cable.setpoints(begun)]
-    assert max(b - a for a, b in pairwise(times)) <= S // 5
-    assert 45 <= len(times) <= 62
+    assert max(b - a for a, b in pairwise(times)) <= {"ardupilot": 3 * S // 10, "px4": S // 5}[flavour]
+    assert len(times) in {"ardupilot": range(18, 22), "px4": range(45, 63)}[flavour]
 
 
 @pytest.mark.parametrize("flavour", FLAVOURS)
@@ -169,7 +169,7 @@ def test_when_a_motion_ends_the_vehicle_is_stopped_and_then_left_alone(flavour: 
     assert cable.commanded == STILL, "at once, not at the next interval"
     cable.drive(2.0)
     late = cable.setpoints(until - MS)
-    assert 5 <= len(late) <= 12
+    assert len(late) in {"ardupilot": range(4, 6), "px4": range(5, 13)}[flavour]
     assert all((m.vx, m.vy, m.vz, m.yaw_rate) == (0.0, 0.0, 0.0, 0.0) for _, m in late)
     assert late[-1][0] <= until + S
     # Told to move again, ArduPilot does; PX4 has left OFFBOARD.

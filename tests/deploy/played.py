@@ -17,10 +17,11 @@ import pytest
 from deploy.agent_files import Host
 from deploy.evaluate import collect
 from deploy.launch import Launcher, Outcome
+from sim.closed_loop import MOTION
 from sim.metrics import StateTrace, nees
 from sim.scenario import Scenario
 from sim.scenario_file import load
-from sim.trial import open_world
+from sim.trial import open_world, played_world
 from tests.deploy.test_processes import alive
 
 SEED = 3
@@ -189,6 +190,8 @@ def play(
     assert not [pid for pid in pids if alive(pid)]
     assert not list(folder.glob("cofix-*")) and not list(folder.rglob("*.sock"))
     there_was = live[0].launcher.played()
+    if found.planners():
+        world = played_world(found, SEED, run_dir / MOTION)
     trace = collect(there_was, world, run_dir, outcome, False, SEED).trace
     ended_s = live[0].ended_s
     # What is published of an instant follows it by as much as data are waited for.

@@ -18,10 +18,12 @@ import tempfile
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import msgpack
+import numpy as np
 import pytest
 import tomli_w
 import zenoh
@@ -30,6 +32,8 @@ from agent.effects import Publish
 from agent.recording import read_boundary, unpack
 from agent.settings import NS
 from agent.state_file import FILE, REFUSED, StateFile
+from sim.metrics import nees
+from sim.scenario_file import load
 from tests.deploy.lan import Lan, missing
 from tests.deploy.played import Live, Played, play, scenario
 from tests.deploy.test_restart import locate
@@ -38,6 +42,7 @@ from tests.desk_agent import DeskAgent, desk_agent
 COFIX = (sys.executable, "-P", "-m", "deploy.cli")
 LONG = pytest.mark.skipif(not os.environ.get("COFIX_MATRIX"), reason="long: make check-matrix")
 ALL = ("r1", "r2", "r3", "r4")
+TEAM = (*ALL, "r5", "r6")
 SILENT_S = 1.5
 """No healthy pair is silent for longer, whoever else is lost."""
 
@@ -198,6 +203,42 @@ def test_cut_in_two_and_healed(tmp_path: Path) -> None:
         assert played.ever(robot, lost(away)) and played.last(robot)["peers"][away]
         assert played.ever(robot, lambda status: "partition-1" in status["injected"].get("faults", []))
         assert "faults" not in played.last(robot)["injected"]
+
+
+# -- robots that choose their motion ------------------------------------------------------------------------
+
+
+@LONG
+def test_who_steers_and_hangs_or_dies_stands_still_and_is_one_of_the_team_again(tmp_path: Path) -> None:
+    """r2 is paused for 20 s, r5 killed; the others keep clear of both, and all rounds are of six robots again."""
+    pause = '{kind = "pause", robot = "r2", at_s = 12.0, for_s = 20.0}'
+    crash = '{kind = "crash", robot = "r5", at_s = 16.0, for_s = 8.0}'
+    found = load("ajlatt", ["duration_s=60.0", "window_s=[0.0, 60.0]", f"faults=[{pause}, {crash}]"])
+    notes: dict[str, Any] = {}
+
+    def closed(live: Live, robot: str) -> int:
+        return int(live.status(robot)["counters"]["round.closed"])
+
+    async def disturb(live: Live) -> None:
+        await live.until(40.0)
+        notes.update({robot: closed(live, robot) for robot in TEAM})
+        await live.until(58.0)
+        notes.update({robot: closed(live, robot) - notes[robot] for robot in TEAM})
+
+    played = play(tmp_path, found, 2.0, disturb)
+    assert played.outcome.exits == dict.fromkeys(TEAM, 0), played.outcome.messages
+    played.assert_honest()
+    for robot in TEAM:
+        assert set(played.last(robot)["steering"]["neighbours"]) == set(TEAM) - {robot}
+        assert notes[robot] >= 16
+    assert played.last("r5")["state_file"]["state.used"] == 1
+    places = {robot: played.robots[robot].truth[:, :2] for robot in TEAM}
+    still = slice(17, 32)
+    assert np.ptp(places["r2"][still], axis=0).max() == 0.0, "commands of before last for 3 s at most"
+    assert np.ptp(places["r2"][36:], axis=0).max() > 1.0
+    for one, other in combinations(TEAM, 2):
+        assert np.linalg.norm(places[one] - places[other], axis=1).min() > 2.0
+    print("ANEES", {robot: round(float(np.nanmean(nees(played.robots[robot])[34:])), 2) for robot in TEAM})
 
 
 # -- one id twice -------------------------------------------------------------------------------------------

@@ -9,9 +9,12 @@ from typing import Any
 
 from rich.console import Console
 
+from agent.autopilot import AutopilotReader
+from agent.autopilot_settings import AutopilotSettings
 from agent.health import Health
 from agent.settings import NS, HealthSettings
-from deploy.status import LiveTable, _cells
+from agent.steering_link import SteeringSettings
+from deploy.status import LiveTable, _cells, stillness
 from sim.scenario_file import load
 
 
@@ -44,3 +47,25 @@ def test_a_neighbour_whose_clock_is_of_no_use_is_named_with_the_reason() -> None
         "clocks": {"r2": clock, "r3": {**clock, "unusable": None}},
     }
     assert _cells(None, status)[1] == "[red]r2 (clock: offset)[/red] r3"
+
+
+def test_it_is_said_why_a_robot_that_is_to_move_does_not() -> None:
+    steering = {"kind": "potential", "neighbours": ["r2"]}
+    running: dict[str, Any] = {"x_m": 0.0, "steering": steering, "tracks": {"t1": {}}}
+    waiting = {"reasons": [], "steering": {"missing": "waiting to be armed"}}
+    assert stillness({**running, "autopilot": waiting}, alone=False) == ["does not move: waiting to be armed"]
+    reader = AutopilotReader(AutopilotSettings(odometry_source="none", steering=SteeringSettings()))
+    (silent,) = stillness({**running, "autopilot": reader.status()}, alone=False)
+    assert silent == "nothing received on the link: is the autopilot on, and the endpoint right?"
+    (alone,) = stillness({**running, "steering": {**steering, "neighbours": []}}, alone=False)
+    assert "no neighbour has told" in alone
+    assert stillness({**running, "steering": {**steering, "neighbours": []}}, alone=True) == []
+    (aimless,) = stillness({**running, "tracks": {}}, alone=False)
+    assert "no target" in aimless
+    assert stillness({**running, "tracks": {}, "steering": {**steering, "kind": "random"}}, alone=False) == []
+    assert stillness(running, alone=False) == stillness({"x_m": 0.0}, alone=False) == []
+
+
+def test_rounds_are_counted_and_those_left_out() -> None:
+    status = {"x_m": 0.0, "y_m": 0.0, "sigma_m": 0.1, "lag_s": 0.0, "counters": {"round.closed": 7, "round.skipped": 2}}
+    assert _cells(None, status)[5] == "7 (2 skipped)"

@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from agent.events import ControlReport
+from agent.events import ControlReport, Received
 from agent.recording import read_boundary, replay
+from agent.settings import NS
+from network.messages import RoundReport
 from sim.closed_loop import MOTION
+from sim.metrics import nees
 from sim.scenario_file import load
+from sim.store import load_trace
 from sim.trial import played_world
 
 pytestmark = pytest.mark.realtime
@@ -63,7 +68,7 @@ for_s = 9.0
 kind = "crash"
 robot = "r3"
 at_s = 10.0
-for_s = 6.0
+for_s = 3.0
 """
 
 COMMAND = (sys.executable, "-P", "-m", "deploy.cli", "run", "steered.toml")
@@ -93,6 +98,7 @@ def test_a_vehicle_goes_as_its_agent_plans_and_stands_when_that_is_gone(tmp_path
         ks = range(round(begin_s * 2), round(end_s * 2) + 1)
         return float(np.sum(np.hypot(*np.diff([world.place(robot, k)[:2] for k in ks], axis=0).T)))
 
+    assert summary["motion"]["min_distance_m"] > 2.0 and summary["motion"]["collisions"] == 0
     for robot in world.robots:
         assert way(robot, 5.0, 10.0) > 1.5
     assert way("r1", 10.0, 30.0) > 5.0
@@ -107,3 +113,25 @@ def test_a_vehicle_goes_as_its_agent_plans_and_stands_when_that_is_gone(tmp_path
     assert reports["r1"][-1] is None and reports["r2"][-1] is None
     assert "OFFBOARD" in str(reports["r3"][-1])
     assert replay(boundary, "r1")[2] is None
+    # Who comes back is heard and hears: reports of rounds that it could not have told before.
+    for robot in world.robots:
+        told = rounds_told(boundary, robot, 24.0)
+        assert set(told) == set(world.robots) - {robot} and min(told.values()) >= 4
+    stored = load_trace(tmp_path / "run")
+    assert stored is not None
+    for robot, trace in stored.trace.robots.items():
+        ratio = nees(trace)[stored.trace.t_s >= 22.0]
+        assert np.isfinite(ratio).all() and ratio.mean() <= 1.7, f"{robot} is overconfident: {ratio.mean():.2f}"
+
+
+def rounds_told(boundary: Path, robot: str, since_s: float) -> Counter[str]:
+    """Reports of rounds after an instant of the run that have come to a robot, by who told them."""
+    events = [event for event, _ in read_boundary(boundary, robot)]
+    since_ns = events[0].t_ns + round(since_s * NS)
+    return Counter(
+        event.message.header.source
+        for event in events
+        if isinstance(event, Received)
+        and isinstance(event.message.body, RoundReport)
+        and event.message.header.t_meas_ns > since_ns
+    )
