@@ -13,9 +13,10 @@ from agent.config_file import ConfigError
 from agent.settings import PlanningSettings, RoundSettings
 from sim.agents import agent_config
 from sim.invariants import InvariantChecker
-from sim.metrics import nees
+from sim.metrics import nees, summarize
 from sim.scenario_file import load
 from sim.trial import open_world, run_trial
+from tests.sizes import sized
 
 
 def made(*overrides: str, name: str = "ut-clat") -> Any:
@@ -162,3 +163,16 @@ def test_planning_is_not_of_steered_nor_of_recorded_worlds() -> None:
 def test_a_fleet_of_rounds_is_accepted() -> None:
     scenario = made("localization.kind=jlatt", "localization.weights=trace")
     assert {scenario.localization_of(robot).kind for robot in scenario.robots} == {"jlatt"}
+
+
+@pytest.mark.parametrize("name", ["ajlatt", "ajlatt-split"])
+def test_a_team_that_plans_finds_its_target_and_claims_no_more_than_it_knows(name: str) -> None:
+    seconds = sized(20, 300)
+    result = run_trial(made(f"duration_s={seconds}", name=name), 41)
+    fleet = summarize([result.trace], (5.0, seconds), 1000.0)["fleet"]
+    assert fleet["target_position_rmse_m"] < 1.0, "the prior is 5 m off in each direction"
+    assert fleet["anees"] < 1.5
+    assert fleet["target_anees"] < 1.5
+    distance = result.motion["min_distance_m"]
+    assert distance is not None and distance > 2.0
+    assert result.motion["connected_share"] == 1.0
