@@ -113,7 +113,7 @@ def test_what_cannot_be_is_refused_with_key_and_remedy(overrides: list[str], wor
 
 
 MIXED = """
-extends = "ajlatt"
+extends = "ajlatt-split"
 name = "mixed"
 duration_s = 30.0
 window_s = [5.0, 30.0]
@@ -150,7 +150,7 @@ def test_robots_and_targets_of_any_model_take_part_in_rounds(tmp_path: Path) -> 
 
 def test_a_start_beside_a_peer_is_not_of_rounds() -> None:
     with pytest.raises(ConfigError, match=r"source = 'peer' does not go with kind = 'jlatt'.*take 'fix' or 'survey'"):
-        made("robots.r2.start_source=peer", name="ajlatt")
+        made("robots.r2.start_source=peer", name="ajlatt-split")
 
 
 def test_planning_is_not_of_steered_nor_of_recorded_worlds() -> None:
