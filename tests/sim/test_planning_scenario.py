@@ -13,9 +13,10 @@ from agent.config_file import ConfigError
 from agent.settings import PlanningSettings, RoundSettings
 from sim.agents import agent_config
 from sim.invariants import InvariantChecker
-from sim.metrics import nees
+from sim.metrics import nees, summarize
 from sim.scenario_file import load
 from sim.trial import open_world, run_trial
+from tests.sizes import sized
 
 
 def made(*overrides: str, name: str = "ut-clat") -> Any:
@@ -112,7 +113,7 @@ def test_what_cannot_be_is_refused_with_key_and_remedy(overrides: list[str], wor
 
 
 MIXED = """
-extends = "ajlatt"
+extends = "ajlatt-split"
 name = "mixed"
 duration_s = 30.0
 window_s = [5.0, 30.0]
@@ -149,7 +150,7 @@ def test_robots_and_targets_of_any_model_take_part_in_rounds(tmp_path: Path) -> 
 
 def test_a_start_beside_a_peer_is_not_of_rounds() -> None:
     with pytest.raises(ConfigError, match=r"source = 'peer' does not go with kind = 'jlatt'.*take 'fix' or 'survey'"):
-        made("robots.r2.start_source=peer", name="ajlatt")
+        made("robots.r2.start_source=peer", name="ajlatt-split")
 
 
 def test_planning_is_not_of_steered_nor_of_recorded_worlds() -> None:
@@ -162,3 +163,16 @@ def test_planning_is_not_of_steered_nor_of_recorded_worlds() -> None:
 def test_a_fleet_of_rounds_is_accepted() -> None:
     scenario = made("localization.kind=jlatt", "localization.weights=trace")
     assert {scenario.localization_of(robot).kind for robot in scenario.robots} == {"jlatt"}
+
+
+@pytest.mark.parametrize("name", ["ajlatt", "ajlatt-split"])
+def test_a_team_that_plans_finds_its_target_and_claims_no_more_than_it_knows(name: str) -> None:
+    seconds = sized(20, 300)
+    result = run_trial(made(f"duration_s={seconds}", name=name), 41)
+    fleet = summarize([result.trace], (5.0, seconds), 1000.0)["fleet"]
+    assert fleet["target_position_rmse_m"] < 1.0, "the prior is 5 m off in each direction"
+    assert fleet["anees"] < 1.5
+    assert fleet["target_anees"] < 1.5
+    distance = result.motion["min_distance_m"]
+    assert distance is not None and distance > 2.0
+    assert result.motion["connected_share"] == 1.0

@@ -17,7 +17,12 @@ SEEDS = range(1, sized(2, 4) + 1)
 
 @pytest.mark.parametrize(
     ("name", "more"),
-    [("dense-6", []), ("dense-6-anchored", ["localization.transform=jacobian"]), ("ut-clat-quadrotors", [])],
+    [
+        ("dense-6", []),
+        ("dense-6-anchored", ["localization.transform=jacobian"]),
+        ("ut-clat-quadrotors", []),
+        ("ajlatt", []),
+    ],
 )
 def test_without_loss_every_robot_has_the_centralized_belief(name: str, more: list[str]) -> None:
     made = load(name, ["duration_s=20", "window_s=[5, 20]", "localization.kind=replica", *more])
