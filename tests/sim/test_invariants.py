@@ -53,7 +53,7 @@ def test_nothing_is_broken_in_rounds(intensity: str) -> None:
         assert checked(scenario, seed) > 1000
 
 
-@pytest.mark.parametrize("name", ["ut-clat-quadrotors", "dense-6", "demo", "ajlatt", "ajlatt-split"])
+@pytest.mark.parametrize("name", ["ut-clat-quadrotors", "dense-6", "demo", "ajlatt", "ajlatt-replica"])
 def test_nothing_is_broken_in_other_worlds(name: str) -> None:
     assert checked(load(name, ["duration_s=20", "window_s=[0, 20]"]), 1) > 100
 

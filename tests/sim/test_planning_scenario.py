@@ -113,7 +113,7 @@ def test_what_cannot_be_is_refused_with_key_and_remedy(overrides: list[str], wor
 
 
 MIXED = """
-extends = "ajlatt-split"
+extends = "ajlatt"
 name = "mixed"
 duration_s = 30.0
 window_s = [5.0, 30.0]
@@ -150,7 +150,7 @@ def test_robots_and_targets_of_any_model_take_part_in_rounds(tmp_path: Path) -> 
 
 def test_a_start_beside_a_peer_is_not_of_rounds() -> None:
     with pytest.raises(ConfigError, match=r"source = 'peer' does not go with kind = 'jlatt'.*take 'fix' or 'survey'"):
-        made("robots.r2.start_source=peer", name="ajlatt-split")
+        made("robots.r2.start_source=peer", name="ajlatt")
 
 
 def test_planning_is_not_of_steered_nor_of_recorded_worlds() -> None:
@@ -165,7 +165,7 @@ def test_a_fleet_of_rounds_is_accepted() -> None:
     assert {scenario.localization_of(robot).kind for robot in scenario.robots} == {"jlatt"}
 
 
-@pytest.mark.parametrize("name", ["ajlatt", "ajlatt-split"])
+@pytest.mark.parametrize("name", ["ajlatt", "ajlatt-replica"])
 def test_a_team_that_plans_finds_its_target_and_claims_no_more_than_it_knows(name: str) -> None:
     seconds = sized(20, 300)
     result = run_trial(made(f"duration_s={seconds}", name=name), 41)

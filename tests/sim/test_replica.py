@@ -21,7 +21,7 @@ SEEDS = range(1, sized(2, 4) + 1)
         ("dense-6", []),
         ("dense-6-anchored", ["localization.transform=jacobian"]),
         ("ut-clat-quadrotors", []),
-        ("ajlatt", []),
+        ("ajlatt-replica", []),
     ],
 )
 def test_without_loss_every_robot_has_the_centralized_belief(name: str, more: list[str]) -> None:
