@@ -139,13 +139,15 @@ class VehiclePart(Part):
     """What the vehicle of a robot with planning can do, whatever it is told.
 
     `min_speed_mps` below 0: it drives backwards too; above 0: it cannot stand still. Without `max_acceleration_mps2`
-    its speed changes at once.
+    its speed changes at once. It `turns` along its way, on an arc, or after it: straight on, and then on the spot, as
+    the discrete unicycle of publications does in each step.
     """
 
     max_speed_mps: Positive = PLAIN.max_speed_mps
     max_turn_radps: Positive = PLAIN.max_turn_radps
     max_acceleration_mps2: Positive | None = None
     min_speed_mps: Finite = 0.0
+    turns: Literal["along", "after"] = "along"
 
 
 class AutopilotPart(Part):

@@ -29,6 +29,11 @@ def arc(begin_mps: float, end_mps: float, yaw_rate_radps: float, seconds: float)
     return np.array([chord.real, chord.imag, 2.0 * half])
 
 
+def leg(begin_mps: float, end_mps: float, yaw_rate_radps: float, seconds: float) -> Array:
+    """The same of a vehicle that drives straight on and turns at the end."""
+    return np.array([0.5 * (begin_mps + end_mps) * seconds, 0.0, yaw_rate_radps * seconds])
+
+
 class Vehicle:
     """Carries out the newest command until it expires, and then stands still, as far as its limits let it.
 
@@ -37,6 +42,7 @@ class Vehicle:
 
     def __init__(self, limits: VehiclePart) -> None:
         self._limits = limits
+        self._way = arc if limits.turns == "along" else leg
         self._now_ns = 0
         self._wanted = self._within(0.0, 0.0)
         self._ahead: list[tuple[int, tuple[float, float]]] = []
@@ -72,12 +78,12 @@ class Vehicle:
         if pull is not None and changing > 0.0:
             change = math.copysign(pull * changing, speed - self.speed_mps)
             reached = speed if changing < seconds else self.speed_mps + change
-            moved = compose(moved, arc(self.speed_mps, reached, yaw_rate, changing))
+            moved = compose(moved, self._way(self.speed_mps, reached, yaw_rate, changing))
             self.speed_mps = reached
         else:
             self.speed_mps = speed
         if changing < seconds:
-            moved = compose(moved, arc(speed, speed, yaw_rate, seconds - changing))
+            moved = compose(moved, self._way(speed, speed, yaw_rate, seconds - changing))
         return moved
 
     def _within(self, speed_mps: float, yaw_rate_radps: float) -> tuple[float, float]:

@@ -143,3 +143,10 @@ def test_limits_hold_whatever_is_commanded() -> None:
         assert 0.0 <= vehicle.speed_mps <= 0.6
         assert abs(vehicle.speed_mps - before) <= 0.25 + 1e-9
         before = vehicle.speed_mps
+
+
+def test_the_discrete_unicycle_drives_straight_on_and_turns_at_the_end_of_each_step() -> None:
+    vehicle = Vehicle(VehiclePart(max_speed_mps=2.0, max_turn_radps=1.0, turns="after"))
+    vehicle.steer(0, Steer((1.5, 0.0, 0.0), 0.5, 10 * NS))
+    np.testing.assert_allclose(vehicle.advance(2 * NS), [3.0, 0.0, 1.0])
+    np.testing.assert_allclose(vehicle.advance(4 * NS), [3.0, 0.0, 1.0])
