@@ -249,8 +249,8 @@ class JlattFilter:
             return
         t_ns = self._open.t_ns
         if now_ns >= t_ns + self._settings.round.wait_ns or self._neighbours.all_told(RoundStage.PRIOR, t_ns):
-            self._close(self._open)
-            self._open = None
+            done, self._open = self._open, None
+            self._close(done)
 
     def _close(self, done: _Open) -> None:
         """Correct the own belief, then the targets, with what has been told by now (Su 2022, eq. 2.8-2.15)."""

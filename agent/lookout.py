@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.effects import Estimate
+from agent.estimation.jlatt import PLACING
 from agent.estimation.motion import LAYOUTS
 from agent.estimation.observation import relative_model
 from agent.estimation.track_start import seen_place
@@ -20,9 +21,6 @@ from agent.rounds import OLDEST_ROUNDS
 from agent.settings import AgentSettings
 
 Array = NDArray[np.float64]
-
-PLACING = ("range_bearing", "vector")
-"""Kinds of measurement in the plane that tell a place."""
 
 
 class Lookout:

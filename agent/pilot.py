@@ -136,13 +136,6 @@ class Pilot:
     # -- what is known --------------------------------------------------------------------------------------
 
     def _situation(self, t_ns: int, index: int, estimate: Estimate) -> Situation:
-        own = RoundReport(
-            RoundStage.POSTERIOR,
-            Belief(estimate.model, estimate.mean, estimate.cov),
-            np.array(self._last.velocity_mps),
-            self._last.yaw_rate_radps,
-            self._report(estimate).targets,
-        )
         newest: dict[str, Told] = {}
         for stage in RoundStage:
             for told in self._neighbours.newest(stage, t_ns):
@@ -151,7 +144,7 @@ class Pilot:
         self._lookout.place(estimate)
         found = [self._member(told.peer, told.report, t_ns - told.t_ns) for told in newest.values()]
         others = [other for other in found if other is not None] + self._lookout.members(t_ns, set(newest))
-        me = self._member(self._settings.robot, own, 0)
+        me = self._member(self._settings.robot, self._report(estimate), 0)
         assert me is not None
         dt_s = self._settings.round.period_ns * 1e-9
         return Situation(index, dt_s, me, tuple(sorted(others, key=lambda other: other.robot)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from agent.estimation.motion import STATES, StateLayout
 from agent.estimation.observation import OutOfViewError, RelativeModel, relative_model
 from agent.events import Observation
 from agent.health import Health
+from agent.peer_tables import remember
 from agent.plausible import agree
 from agent.round_carry import Carrier
 from agent.round_tracks import RoundTracks
@@ -100,16 +102,29 @@ class RoundFusion:
             if then is None:
                 self._counters["late.dropped"] += 1
                 continue
-            found = [*self._of_peers(then, t_ns, detected, told), *self._of_targets(then, t_ns, tracks, seen)]
+            found: list[Detection] = []
+            with self._counted_failure():
+                found += self._of_peers(then, t_ns, detected, told)
+            with self._counted_failure():
+                found += self._of_targets(then, t_ns, tracks, seen)
             if not found:
                 continue
-            mean, cov = robot_update(
-                then.mean, then.cov, self._settings.layout.angles, found, self._settings.localization.weights
-            )
-            if own.correct(then, mean, cov):
-                self._counters["round.used_detections"] += len(found)
-            else:
-                self._counters["update.not_positive_definite"] += 1
+            with self._counted_failure():
+                mean, cov = robot_update(
+                    then.mean, then.cov, self._settings.layout.angles, found, self._settings.localization.weights
+                )
+                if own.correct(then, mean, cov):
+                    self._counters["round.used_detections"] += len(found)
+                else:
+                    self._counters["update.not_positive_definite"] += 1
+
+    @contextmanager
+    def _counted_failure(self) -> Iterator[None]:
+        """What a peer told may lead to a matrix that can't be inverted: that is not used, and the round goes on."""
+        try:
+            yield
+        except np.linalg.LinAlgError:
+            self._counters["update.failed"] += 1
 
     def _of_peers(
         self, then: Moment, t_ns: int, detected: dict[str, Detected], told: dict[str, Told]
@@ -177,7 +192,9 @@ class RoundFusion:
         """Where an own measurement places a target at `t_ns`; None if it alone does not tell."""
         altitude = seen.model.subject.altitude
         variance = 0.0 if altitude is None else float(track.cov[altitude, altitude])
-        found = target_correction(seen.model, own.mean, own.cov, track.mean, seen.z, seen.R, variance)
+        found = None
+        with self._counted_failure():
+            found = target_correction(seen.model, own.mean, own.cov, track.mean, seen.z, seen.R, variance)
         if found is None:
             self._counters["round.undetermined"] += 1
             return None
@@ -195,9 +212,10 @@ class RoundFusion:
         """Use what all believe of each target at `t_ns`, and where all place it."""
         trusted = {peer: item for peer, item in told.items() if self._health.trusts(peer)}
         for target in self._settings.tracked:
-            self._correct(target.id, tracks, t_ns, corrections.get(target.id), seen.get(target.id), trusted)
+            with self._counted_failure():
+                self._correct(target.id, tracks, t_ns, corrections.get(target.id), seen.get(target.id), trusted)
         for peer, item in told.items():
-            self._used[peer] = item.t_ns
+            remember(self._used, peer, item.t_ns)
 
     def _correct(
         self,

@@ -183,6 +183,24 @@ def test_who_is_quarantined_tells_nothing_of_targets_either() -> None:
     assert agent.counters["round.closed"] == 2 and agent.counters["round.used_corrections"] == 0
 
 
+@pytest.mark.parametrize("broken", ["robot_update", "target_update", "target_correction", "agree"])
+def test_a_matrix_that_cannot_be_inverted_ends_no_round(monkeypatch: pytest.MonkeyPatch, broken: str) -> None:
+    def singular(*_: object) -> None:
+        raise np.linalg.LinAlgError
+
+    sender = Agent(settings_of("r2", mean=np.array([0.0, 2.0, 0.0])))
+    told_by(sender, Tick(0))
+    (report,) = told_by(sender, drive(1, 0.0), sight(1, "target:t1", (8.0, -0.1)), Tick(NS))
+    monkeypatch.setattr(f"agent.round_fusion.{broken}", singular)
+    agent = Agent(settings_of())
+    told_by(agent, Tick(0), Tick(ROUND.wait_ns), LinkChange(0, "r2", True, 1, 1))
+    events = (drive(1, 0.0), sight(1, "r2", (2.0, 1.57)), sight(1, "target:t1", (8.0, 0.1)), heard(report, NS))
+    told_by(agent, *events, Tick(NS), Tick(NS + ROUND.wait_ns))
+    assert agent.counters["update.failed"] >= 1
+    assert agent.counters["round.closed"] == 2
+    assert told_by(agent, drive(2), Tick(2 * NS)), "it goes on"
+
+
 def test_a_detection_of_somebody_unheard_is_no_use_and_counted() -> None:
     agent = Agent(settings_of())
     told_by(agent, Tick(0), drive(1), sight(1, "r2", (5.0, 0.0)), Tick(NS), Tick(NS + ROUND.wait_ns))
