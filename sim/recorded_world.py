@@ -12,7 +12,6 @@ from agent.calibration import Calibration, corrected
 from agent.config_file import ConfigError
 from agent.effects import Steer
 from agent.estimation.gaussian import wrap_components
-from agent.estimation.motion import LAYOUTS
 from agent.estimation.observation import ABSOLUTE, RELATIVE_ANGLES
 from agent.settings import NS, nanoseconds
 from agent.timeline import Phase
@@ -20,7 +19,7 @@ from sim.noise import normal_rows
 from sim.recordings import LOADERS
 from sim.recordings.recording import Recording
 from sim.scenario import RobotPart, Scenario, SensorPart, sensor_kind
-from sim.world import Output, absolute_noise, control_odometry, drawn_belief, order, phase_of, relative_noise
+from sim.world import Output, absolute_noise, control_odometry, order, phase_of, relative_noise, start_belief
 
 Array = NDArray[np.float64]
 
@@ -105,11 +104,10 @@ class RecordedWorld:
 
     def start_belief(self, entity: str) -> tuple[Array, Array]:
         part = self._scenario.movers()[entity]
-        cov = part.start_sigma.covariance(part.model)
         if self._known(entity):
-            truth = self.truth(entity, 0)
-            return drawn_belief(truth, cov, self.seed, entity, LAYOUTS[part.model].angles)
+            return start_belief(part, self.truth(entity, 0), self.seed)
         assert part.start.pose is not None
+        cov = part.start_sigma.covariance(part.model)
         return np.append(part.start.pose, np.ones(len(cov) - len(part.start.pose))), cov
 
     def truth(self, entity: str, k: int) -> Array:

@@ -97,11 +97,13 @@ class CirclePart(Part):
 class StartPart(Part):
     """True start: a pose (x, y[, z], heading), a full target state, or a place on a circle drawn from the seed.
 
-    A pose may be off by up to `spread` (of each number), drawn evenly from the seed.
+    A pose may be off by up to `spread` (of each number), drawn evenly from the seed. The belief of it is off by `error`
+    (of each number), or by a draw from start_sigma.
     """
 
     pose: Annotated[list[Finite], Field(min_length=3, max_length=6)] | None = None
     spread: Annotated[list[NotNegative], Field(max_length=6)] = []
+    error: list[Finite] | None = None
     circle: CirclePart | None = None
 
 

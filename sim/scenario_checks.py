@@ -218,6 +218,9 @@ def _check_mover(where: str, part: RobotPart | TargetPart) -> None:
         part.start_sigma.covariance(part.model, isinstance(part, RobotPart) or part.prior)
     except ConfigError as error:
         raise ConfigError(f"{where}.{error}") from None
+    size = LAYOUTS[part.model].dim - 2 * (part.model == "unicycle_gains")
+    if part.start.error is not None and len(part.start.error) != size:
+        raise ConfigError(f"{where}.start.error has {len(part.start.error)} numbers, not the {size} of '{part.model}'")
     try:
         if isinstance(part, RobotPart):
             part.motion().settings()

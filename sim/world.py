@@ -188,8 +188,7 @@ class SimulatedWorld:
 
     def start_belief(self, entity: str) -> tuple[Array, Array]:
         part = self._scenario.movers()[entity]
-        cov = part.start_sigma.covariance(part.model)
-        return drawn_belief(self._tracks[entity][0], cov, self.seed, entity, LAYOUTS[part.model].angles)
+        return start_belief(part, self._tracks[entity][0], self.seed)
 
     def steer(self, robot: str, t_ns: int, steer: Steer) -> None:
         if self._loop is None:
@@ -285,15 +284,17 @@ class SimulatedWorld:
         return roll, pitch
 
 
-def drawn_belief(truth: Array, cov: Array, seed: int, entity: str, angles: tuple[int, ...]) -> tuple[Array, Array]:
-    """Initial belief: truth plus a draw from its covariance; `angles` are wrapped.
+def start_belief(part: RobotPart | TargetPart, truth: Array, seed: int) -> tuple[Array, Array]:
+    """Initial belief: the truth and its stated error, or else a draw from its covariance, as that of all gains is.
 
     A truth that is shorter than the state leaves gains of an odometry open: they are 1, as far as is known.
     """
-    known, n = len(truth), len(cov)
-    draw = generator(seed, entity, "start").standard_normal(known)
-    mean = np.append(truth + np.sqrt(np.diagonal(cov)[:known]) * draw, np.ones(n - known))
-    return wrap_components(mean, angles), cov
+    cov, known = part.start_sigma.covariance(part.model), len(truth)
+    error = np.sqrt(np.diagonal(cov)[:known]) * generator(seed, part.id, "start").standard_normal(known)
+    if part.start.error is not None:
+        error[: len(part.start.error)] = part.start.error
+    mean = np.append(truth + error, np.ones(len(cov) - known))
+    return wrap_components(mean, LAYOUTS[part.model].angles), cov
 
 
 def start_pose(robot: RobotPart | TargetPart, phases: dict[str, float], seed: int) -> Array:

@@ -124,13 +124,13 @@ start_sigma = { gain_along = 0.05, gain_turn = 0.05 }
 [[robots]]
 id = "r3"
 model = "planar_altitude"
-start = { pose = [-6.0, 13.0, 1.0, 0.0], spread = [0.5, 0.5, 0.2, 1.0] }
+start = { pose = [-6.0, 13.0, 1.0, 0.0], spread = [0.5, 0.5, 0.2, 1.0], error = [0.0, 0.0, 0.0, 0.0] }
 start_sigma = { altitude_m = 0.1 }
 noise = { climb_mps = 0.01 }
 [[targets]]
 id = "t1"
 model = "constant_velocity"
-start = { pose = [10.0, 5.0, 0.25, 0.0] }
+start = { pose = [10.0, 5.0, 0.25, 0.0], error = [0.0, 5.0, 0.0, 0.0] }
 start_sigma = { velocity_mps = 0.2 }
 noise = { acceleration_mps2 = 0.01 }
 """

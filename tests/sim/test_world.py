@@ -141,6 +141,24 @@ def test_initial_beliefs_are_drawn_from_their_covariance() -> None:
     assert is_chi_square(np.array(squares), 3, 300)
 
 
+def test_a_start_that_is_told_with_an_error_is_off_by_it() -> None:
+    plain = scenario().model_dump(exclude_none=True)["robots"]
+    plain[0]["start"]["error"] = [0.0, 5.0, 0.1]
+    made = scenario(robots=plain)
+    for seed in (1, 2):
+        world = SimulatedWorld(made, seed)
+        mean, cov = world.start_belief(plain[0]["id"])
+        assert np.allclose(mean - world.truth(plain[0]["id"], 0), [0.0, 5.0, 0.1])
+        assert np.array_equal(cov, made.robots[0].start_sigma.covariance("unicycle"))
+
+
+def test_an_error_of_the_start_of_the_wrong_size_is_named() -> None:
+    plain = scenario().model_dump(exclude_none=True)["robots"]
+    plain[0]["start"]["error"] = [0.0]
+    with pytest.raises(ConfigError, match=r"r1\.start\.error has 1 numbers, not the 3 of 'unicycle'"):
+        check(scenario(robots=plain))
+
+
 # --- sensors ----------------------------------------------------------------------------------------------
 
 SENSORS: dict[str, dict[str, Any]] = {
