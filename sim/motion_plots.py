@@ -71,7 +71,7 @@ def _costs(axes: Any, radio_range_m: float, sensor_range_m: float) -> None:
     seen = sensor_range_m - SENSOR_MARGIN_M
     axes.axvline(sensor_range_m, color=PALE, lw=1.0, zorder=1)
     axes.annotate(
-        "the sensor ends",
+        "the sensor\nends",
         (sensor_range_m, 0.98 * HIGHEST),
         xytext=(4, 0),
         textcoords="offset points",
