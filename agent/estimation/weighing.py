@@ -52,7 +52,7 @@ def weighed(
     whitened = root.swapaxes(-1, -2)[..., None, :, :] @ informations @ root[..., None, :, :]
     whitened = np.where(used[..., None, None], whitened, 0.0)
     if rule == "trace" or rule == "logdet":
-        weights = _least(root, whitened, used, rule)
+        weights = _least_where_used(root, whitened, used, rule)
     else:
         weights = _by_size(prior, np.where(used[..., None, None], informations, 0.0), used, rule, staged)
     inverse = np.asarray(np.linalg.inv(_sum(weights, whitened)))
@@ -76,6 +76,19 @@ def _sum(weights: Array, whitened: Array) -> Array:
     flat = whitened.reshape(*whitened.shape[:-3], m, n * n)
     found = (weights[..., None, 1:] @ flat).reshape(*weights.shape[:-1], n, n)
     return np.asarray(found + weights[..., :1, None] * np.eye(n))
+
+
+def _least_where_used(root: Array, whitened: Array, used: Mask, rule: Rule) -> Array:
+    """`_least`, without its iterations where there is nothing to weigh, as for most candidates of a planner."""
+    if used.ndim == 1:
+        return _least(root, whitened, used, rule) if used.any() else np.eye(1, 1 + len(used))[0]
+    some = used.any(axis=-1)
+    weights = np.zeros((*used.shape[:-1], 1 + used.shape[-1]))
+    weights[..., 0] = 1.0
+    if some.any():
+        root = np.broadcast_to(root, (*some.shape, *root.shape[-2:]))
+        weights[some] = _least(root[some], whitened[some], used[some], rule)
+    return weights
 
 
 def _least(root: Array, whitened: Array, used: Mask, rule: Rule) -> Array:
