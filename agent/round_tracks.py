@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.course import Course, Moment
+from agent.estimation.gaussian import wrap_components
 from agent.estimation.motion import StateLayout
 from agent.estimation.observation import RelativeModel
-from agent.estimation.unscented import Transform
+from agent.estimation.unscented import Propagated
 from agent.joint_tracks import JointState, RelayedTrack
 from agent.settings import AgentSettings
 from agent.tracks import TrackRules
@@ -71,22 +72,26 @@ class RoundTracks:
     def advance(self, t_ns: int) -> None:
         """Move all tracks to the later instant `t_ns`; those that are over by then end."""
         for target, track in list(self._tracks.items()):
-            now = track.course.newest
-            transform = self._transform(track)
-            moved = self._motions[target].drift(now.mean, now.cov, (t_ns - now.t_ns) * 1e-9, transform)
-            track.course.advance(t_ns, moved)
+            track.course.advance(t_ns, self._moved(target, track, t_ns))
             self._end_if_over(target, track)
         self._t_ns = t_ns
 
-    def _transform(self, track: _Track) -> Transform:
-        """Of a target that nobody has seen lately, a heading that is off stays off: its way is no straight line then.
+    def _moved(self, target: str, track: _Track, t_ns: int) -> Propagated:
+        """A belief moved to the later instant `t_ns`.
 
-        One that is followed is corrected before that shows.
+        Of a target that nobody has seen lately, a heading that is off stays off, and spreads where it may be far more
+        than a linearized prediction says; one that is followed is corrected before that shows. The mean of all those
+        places lags behind the likeliest one, where robots had better look for it: that stays the mean, and the
+        covariance is the second moment about it.
         """
-        lately_ns = FOLLOWED_ROUNDS * self._settings.round.period_ns
-        if track.course.newest.t_ns - track.learnt_ns > lately_ns:
-            return "unscented"
-        return self._settings.localization.transform
+        now, motion = track.course.newest, self._motions[target]
+        dt_s, transform = (t_ns - now.t_ns) * 1e-9, self._settings.localization.transform
+        ahead = motion.drift(now.mean, now.cov, dt_s, transform)
+        if now.t_ns - track.learnt_ns <= FOLLOWED_ROUNDS * self._settings.round.period_ns:
+            return ahead
+        spread = motion.drift(now.mean, now.cov, dt_s, "unscented")
+        away = wrap_components(spread.mean - ahead.mean, motion.layout.angles)
+        return Propagated(ahead.mean, spread.cov + np.outer(away, away), spread.F)
 
     def _end_if_over(self, target: str, track: _Track) -> None:
         now = track.course.newest

@@ -13,7 +13,9 @@ Of several targets only the nearest can be too far then: who keeps between all s
 Without a target the sum is left without its terms: robots keep apart and in reach, and stand still apart from that.
 
 The cost jumps where something gets into view, so nothing is known of gradients: the best of a grid of speeds and yaw
-rates is taken, then twice the best of its eight neighbours at half the spacing before.
+rates is taken, then twice the best of its eight neighbours at half the spacing before. Of equal ones an `improved`
+planner takes the slowest and straightest; the `published` one, whose order nobody knows, the first of the grid: a robot
+that has nothing to gain stands and turns on the spot, as long as it sees nothing.
 """
 
 from __future__ import annotations
@@ -70,9 +72,13 @@ class Search:
     max_turn_radps: float
     speeds: int
     rounds: int
+    straight: bool = True
+    """Whether of equal commands the straightest is taken, not the first."""
 
     @classmethod
-    def within(cls, candidates: int, max_speed_mps: float, max_turn_radps: float) -> Search:
+    def within(
+        cls, candidates: int, max_speed_mps: float, max_turn_radps: float, straight: bool = True
+    ) -> Search:
         """The search that evaluates at most so many: 5 x 9 + 8 + 8 = 61; with fewer a coarser grid, then fewer rounds.
 
         Raises ValueError below six.
@@ -83,13 +89,14 @@ class Search:
         speeds = 2
         while (speeds + 1) * (2 * speeds + 1) + 8 * rounds <= candidates:
             speeds += 1
-        return cls(max_speed_mps, max_turn_radps, speeds, rounds)
+        return cls(max_speed_mps, max_turn_radps, speeds, rounds, straight)
 
     def best(self, cost: Callable[[Array], Array]) -> Array:
-        """The command (2,) of least cost; `cost` of commands (c, 2) is (c,). Of equal ones the slowest, straightest."""
+        """The command (2,) of least cost; `cost` of commands (c, 2) is (c,). Of equal ones one of the slowest."""
         n = self.speeds
         speeds, turns = np.linspace(0.0, self.max_speed_mps, n), np.linspace(-1.0, 1.0, 2 * n - 1) * self.max_turn_radps
-        turns = turns[np.argsort(np.abs(turns), kind="stable")]
+        if self.straight:
+            turns = turns[np.argsort(np.abs(turns), kind="stable")]
         grid = np.stack(np.meshgrid(speeds, turns, indexing="ij"), axis=-1).reshape(-1, 2)
         chosen, least = _least(grid, cost(grid))
         step = np.array([self.max_speed_mps, self.max_turn_radps]) / (n - 1)
@@ -121,7 +128,8 @@ class OptimalPlanner:
     def __init__(self, settings: PlanningSettings, fallback: PotentialPlanner) -> None:
         self._settings, self._fallback = settings, fallback
         self._improved = settings.form == "improved"
-        self._search = Search.within(settings.candidates, settings.max_speed_mps, settings.max_turn_radps)
+        limits = settings.max_speed_mps, settings.max_turn_radps
+        self._search = Search.within(settings.candidates, *limits, straight=self._improved)
 
     def command(self, situation: Situation) -> Command:
         """Within the vehicle's limits; see `agent.planning.situation.Planner`."""
