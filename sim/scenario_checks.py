@@ -71,6 +71,7 @@ def check(scenario: Scenario) -> None:
         try:
             localization.settings()
             tracking.check_kind(localization, [target.id for target in scenario.targets if not target.prior])
+            tracking.check_targets([(target.id, target.model) for target in scenario.targets])
             if localization.form == "joint":
                 followed = scenario.targets if tracking.kind != "none" else []
                 check_room(LAYOUTS[robot.model], [(target.id, LAYOUTS[target.model]) for target in followed])
@@ -141,6 +142,12 @@ def _check_team(scenario: Scenario) -> None:
                 f"{scenario.name}: robots.{other}.localization.kind = '{kinds[other]}' beside '{kind}': {why}; "
                 "give all robots one kind"
             )
+    tracked = {scenario.tracking_of(robot).kind for robot in scenario.robots} - {"none"}
+    if len(tracked) > 1:
+        raise ConfigError(
+            f"{scenario.name}: tracking.kind is {' and '.join(map(repr, sorted(tracked)))}: robots do not understand "
+            "what another kind tells; give all robots one kind, or 'none'"
+        )
     if "replica" in kinds.values() and len(kinds) > MAX_TEAM + 1:
         raise ConfigError(
             f"{scenario.name}: localization.kind = 'replica' takes {MAX_TEAM + 1} robots at most, there are "
