@@ -188,7 +188,10 @@ class LinksPart(Part):
     def settings(self, seed: int) -> LinkSettings:
         """Raises `ConfigError` if senders are chosen in two ways."""
         if self.nearest is not None and self.rewire is not None:
-            raise ConfigError("links.nearest and links.rewire both choose who is heard; leave one of them out")
+            raise ConfigError(
+                "links.nearest and links.rewire both choose who is heard; state one, as "
+                f"links = {{ rewire = {self.rewire} }}"
+            )
         return LinkSettings(seed=seed, **self.model_dump())
 
 
