@@ -114,9 +114,9 @@ class VirtualEngine:
             for robot in scenario.robots
         }
         self._range = RangeTable()
-        links = scenario.links
-        self._reach = None if links.range_m is None else Reach(world, links.range_m, links.hysteresis_m)
-        self._links = LinkModel(links.settings(seed), self._range.state, fate_sink, self._faults.links)
+        links = scenario.links.settings(seed)
+        self._reach = Reach(world, links) if links.limited else None
+        self._links = LinkModel(links, self._range.state, fate_sink, self._faults.links)
         self._sampler = Sampler(scenario, world, with_bound)
         self._bound = BoundRunner(scenario, world) if with_bound else None
         self.contacts: list[tuple[float, str, str]] = []

@@ -50,6 +50,10 @@ def check(scenario: Scenario) -> None:
             f"{scenario.name}: world.placement.reaches = '{placement.reaches}' is no robot on a circle; "
             f"there are: {', '.join(circling)}"
         )
+    try:
+        scenario.links.settings(0)
+    except ConfigError as error:
+        raise ConfigError(f"{scenario.name}: {error}") from None
     _check_steering(scenario)
     _check_planning(scenario)
     _check_team(scenario)
@@ -89,6 +93,8 @@ def check(scenario: Scenario) -> None:
         for name, sensor in robot.sensors.items():
             where = f"{scenario.name}: robots.{robot.id}.sensors.{name}"
             check_sensor(where, name, sensor)
+            if recorded:
+                _check_recorded(where, sensor)
     for target in scenario.targets:
         _check_mover(f"{scenario.name}: targets.{target.id}", target)
         if target.recorded != recorded:
@@ -103,6 +109,7 @@ def check(scenario: Scenario) -> None:
             )
         if not recorded and target.start.pose is None:
             raise ConfigError(f"{scenario.name}: targets.{target.id}.start.pose is missing")
+        _check_course(f"{scenario.name}: targets.{target.id}", target)
 
 
 def _check_autopilot(where: str, robot: RobotPart) -> None:
@@ -219,6 +226,25 @@ def _check_steering(scenario: Scenario) -> None:
             raise ConfigError(f"{where}: robots.{robot.id}.control is not used with it; leave it out")
 
 
+def _check_course(where: str, target: TargetPart) -> None:
+    """A course is of a target that moves by its velocity, in a simulated world."""
+    if target.course is None:
+        return
+    try:
+        target.course.check(target.model)
+    except ConfigError as error:
+        raise ConfigError(f"{where}.{error}") from None
+    if target.recorded:
+        raise ConfigError(f"{where}.course does not go with a recording, where it went its way already; leave it out")
+
+
+def _check_recorded(where: str, sensor: SensorPart) -> None:
+    """What a recorded sensor said is not made worse."""
+    for key in ("noise", "detects", "false_share"):
+        if getattr(sensor, key) != getattr(SensorPart(), key):
+            raise ConfigError(f"{where}.{key} does not go with a recording, which is as it is; leave it out")
+
+
 def _check_mover(where: str, part: RobotPart | TargetPart) -> None:
     """Deviations of the start, altitude noise and size of the pose are those the model needs."""
     try:
@@ -255,3 +281,10 @@ def check_sensor(where: str, name: str, sensor: SensorPart) -> None:
         raise ConfigError(f"{where}: sigma_px is missing")
     if kind in RELATIVE_ANGLES and not sensor.of:
         raise ConfigError(f'{where}: of is missing, for instance of = ["peers"]')
+    for key, kinds in (
+        ("noise", ("bearing3",)),
+        ("detects", tuple(RELATIVE_ANGLES)),
+        ("false_share", ("bearing", "bearing3")),
+    ):
+        if getattr(sensor, key) != getattr(SensorPart(), key) and kind not in kinds:
+            raise ConfigError(f"{where}.{key} is of kind {' and '.join(kinds)}, not of '{kind}'; leave it out")
