@@ -30,6 +30,9 @@ from network.messages import Bearing, BearingReport, Prediction
 
 Array = NDArray[np.float64]
 
+PRECISE = ("kcf_plus", "icf_plus")
+"""Kinds that keep a covariance, know how the target's noise is stated, and can begin with a prior."""
+
 UNCROSSED_NS = 5_000_000_000
 """A track is no longer made known when bearings have not crossed for so long: along the ray nothing is known then."""
 
@@ -63,7 +66,7 @@ class Triangulator:
         tracking = self._settings.tracking
         if tracking.kind == "stt" and tracking.memory_s is not None:
             return {"memory_s": tracking.memory_s}
-        if tracking.kind not in ("kcf_plus", "icf_plus"):
+        if tracking.kind not in PRECISE:
             return {}
         sigma = max(target.motion.noise_sigma)
         return {"q": sigma**2 * target.motion.noise_step_s}
@@ -125,9 +128,7 @@ class Triangulator:
         if track is None:
             if not sights and not told:
                 return
-            before_ns = t_ns - self._settings.round.period_ns
-            track = _Track(before_ns, self._filters[target].start(place), before_ns)
-            self._tracks[target] = track
+            track = self._tracks[target] = self._begun(target, t_ns, place)
             self._counters["track.started"] += 1
         if sights:
             track.learnt_ns = t_ns - round(min(float(item.age_s) for item in sights) * 1e9)
@@ -142,6 +143,14 @@ class Triangulator:
         simultaneous = [item for item in sights if float(item.age_s) <= 2e-9 * self._settings.round.period_ns]
         if tracking.parallax_rad == 0.0 or crosses(simultaneous, tracking.parallax_rad):
             track.crossed_ns = t_ns
+
+    def _begun(self, target: str, t_ns: int, place: Array) -> _Track:
+        """The track before the round at `t_ns`: of a prior that all have, or, as published, at the robot's own place."""
+        settings, start_ns = self._targets[target], self._settings.start_ns
+        if settings.mean is not None and self._settings.tracking.kind in PRECISE and t_ns > start_ns:
+            return _Track(start_ns, TrackState(settings.mean, settings.cov), start_ns, start_ns)
+        before_ns = t_ns - self._settings.round.period_ns
+        return _Track(before_ns, self._filters[target].start(place), before_ns)
 
     @staticmethod
     def _sane(state: TrackState) -> bool:
