@@ -49,6 +49,9 @@ from agent.unsafe_parts import UnsafePart
 
 Subject = Literal["peers", "landmarks", "targets"]
 
+SPATIAL_FORMATS = ("drone_cameras",)
+"""Recordings in space; those of other formats are planar."""
+
 MIN_STEP_S = 0.001
 """The shortest step of a world."""
 
@@ -82,7 +85,7 @@ class SteeringPart(Part):
 
 class WorldPart(Part):
     kind: Literal["simulated", "recording"] = "simulated"
-    format: Literal["utias", "tiers"] = "utias"
+    format: Literal["utias", "tiers", "drone_cameras"] = "utias"
     path: str | None = None
     robots: list[Id] | None = None
     placement: PlacementPart | None = None
@@ -111,9 +114,10 @@ class SensorPart(Part):
     """A sensor: what it measures (`kind`, by default its name), of whom, how well, how far and how often.
 
     sigma_m grows by sigma_m_per_m with the distance; sigma_z_m is that of an altitude, sigma_m by default. `rate_hz`
-    absent: once per step. Nothing is seen beyond `max_range_m`, nearer than `min_range_m` or out of the field of view
-    `fov_rad`, which is centred on the sensor's forward axis. Simulated ranges are too long by `bias_m`, or by what
-    `bias_of` says of the subject.
+    absent: once per step; of recorded sightings all, and at most so many otherwise. Nothing is seen beyond
+    `max_range_m`, nearer than `min_range_m` or out of the field of view `fov_rad`, which is centred on the sensor's
+    forward axis. Simulated ranges are too long by `bias_m`, or by what `bias_of` says of the subject. A recorded camera
+    has the mount and intrinsics of the recording.
     """
 
     kind: SensorKind | None = None

@@ -1,13 +1,13 @@
 """Loader of part 3 of the multi-view drone tracking set (Li et al. 2020, arXiv 2003.04784): cameras that see one drone.
 
-The folder of the part holds `cameras.txt`, `detections/camK.txt` and `rtk.txt`, plain or `.xz`; calibrations are in the
-folder `calibration` beside it. Camera K is the robot `camK`, which stands; the drone is the target `t1`, whose truth is
-the RTK track in its local east-north-up frame. Pixels are those of an ideal pinhole camera: lens distortion is taken off,
-and pixels are made square.
+The folder of the part holds `cameras.txt`, `detections/camK.txt` and `rtk.txt`, plain or `.xz`; calibrations are in
+the folder `calibration` beside it. Camera K is the robot `camK`, which stands; the drone is the target `t1`, whose
+truth is the RTK track in its local east-north-up frame. Pixels are those of an ideal pinhole camera: lens distortion is
+taken off, and pixels are made square.
 
-Clocks: frames become time by the authors' table and the rate of camera 0. The track has no stamps; instant 0 is its first
-row. Its shift from the cameras' clock is found from the data, and so are the poses of the cameras, since the surveyed ones are in
-another frame: both are fitted to the truth, which makes them better than a survey in the field would be.
+Frames become time by the authors' table and the rate of camera 0. The track has no stamps; instant 0 is its first row.
+Its shift from the cameras' clock is found from the data, and so are the poses of the cameras, since the surveyed places
+are in another frame. Both are fitted to the truth: they are better than a survey in the field would be.
 """
 
 from __future__ import annotations

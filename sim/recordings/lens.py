@@ -36,7 +36,7 @@ class Lens:
     def undistorted(self, pixels: Array) -> Array:
         """Pixels (K, 2) of the ideal camera for pixels (K, 2) of this one; NaN where no point is seen there."""
         ideal = self.ideal()
-        return ideal.focal_px * self.plane(pixels) + np.array(ideal.center_px)
+        return np.asarray(ideal.focal_px * self.plane(pixels) + np.array(ideal.center_px))
 
     def plane(self, pixels: Array) -> Array:
         """Where (K, 2) rays of pixels (K, 2) meet the plane at unit distance, right and down; NaN where nowhere.

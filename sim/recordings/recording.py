@@ -122,7 +122,7 @@ class Recording:
         return np.asarray(pose)
 
     def velocity_at(self, robot: str, t_ns: int) -> Array:
-        """True velocity (2,) or (3,) around an instant, from truth a quarter of a second to either side where it is known."""
+        """True velocity (2,) or (3,) around an instant, from truth 0.25 s to either side where it is known."""
         truth = self._robot(robot).truth
         first, last = (t_ns, t_ns) if truth is None else (int(truth.t_ns[0]), int(truth.t_ns[-1]))
         before, after = max(t_ns - VELOCITY_SPAN_NS, first), min(t_ns + VELOCITY_SPAN_NS, last)
