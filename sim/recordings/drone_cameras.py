@@ -68,12 +68,12 @@ def load(path: str | Path) -> Recording:
     rate_hz = _calibration(folder, models[0])[1]
     seen, left_out = {}, []
     for number, model in enumerate(models):
-        lens, fps = _calibration(folder, model)
-        _check_rate(folder, number, fps, rate_hz)
         if _found(folder / "detections" / f"cam{number}.txt") is None:
             left_out.append(f"cam{number}")
-        else:
-            seen[f"cam{number}"] = _seen(folder, number, lens, rate_hz, counters)
+            continue
+        lens, fps = _calibration(folder, model)
+        _check_rate(folder, number, fps, rate_hz)
+        seen[f"cam{number}"] = _seen(folder, number, lens, rate_hz, counters)
     if not seen:
         raise RecordingError(f"{folder}: detections are missing; {REMEDY}")
     try:
