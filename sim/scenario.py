@@ -52,6 +52,9 @@ from sim.directions import DirectionNoise
 
 Subject = Literal["peers", "landmarks", "targets"]
 
+SPATIAL_FORMATS = ("drone_cameras",)
+"""Recordings in space; those of other formats are planar."""
+
 MIN_STEP_S = 0.001
 """The shortest step of a world."""
 
@@ -85,7 +88,7 @@ class SteeringPart(Part):
 
 class WorldPart(Part):
     kind: Literal["simulated", "recording"] = "simulated"
-    format: Literal["utias", "tiers"] = "utias"
+    format: Literal["utias", "tiers", "drone_cameras"] = "utias"
     path: str | None = None
     robots: list[Id] | None = None
     placement: PlacementPart | None = None
@@ -114,10 +117,12 @@ class SensorPart(Part):
     """A sensor: what it measures (`kind`, by default its name), of whom, how well, how far and how often.
 
     sigma_m grows by sigma_m_per_m with the distance; sigma_z_m is that of an altitude, sigma_m by default. `rate_hz`
-    absent: once per step. Nothing is seen beyond `max_range_m`, nearer than `min_range_m` or out of the field of view
-    `fov_rad`, which is centred on the sensor's forward axis. Simulated ranges are too long by `bias_m`, or by what
-    `bias_of` says of the subject. Directions (`bearing3`) err by `noise`, see `sim.directions`. Who could be seen is
-    detected with the probability `detects`; the share `false_share` of detections is of a direction drawn evenly.
+    absent: once per step; of recorded sightings all, and at most so many otherwise. Nothing is seen beyond
+    `max_range_m`, nearer than `min_range_m` or out of the field of view `fov_rad`, which is centred on the sensor's
+    forward axis. Simulated ranges are too long by `bias_m`, or by what `bias_of` says of the subject. Directions
+    (`bearing3`) err by `noise`, see `sim.directions`. Who could be seen is detected with the probability `detects`; the
+    share `false_share` of detections is of a direction drawn evenly. A recorded camera has the mount and intrinsics of
+    the recording.
     """
 
     kind: SensorKind | None = None

@@ -12,7 +12,17 @@ from agent.fault_parts import AnyFaultPart, SensorDelayPart, SensorFaultPart, ch
 from agent.joint_room import check_room
 from agent.motion_parts import ControlPart
 from agent.start_config import check_start
-from sim.scenario import KINDS, MIN_STEP_S, RobotPart, Scenario, SensorPart, TargetPart, sensor_kind, target_sensor
+from sim.scenario import (
+    KINDS,
+    MIN_STEP_S,
+    SPATIAL_FORMATS,
+    RobotPart,
+    Scenario,
+    SensorPart,
+    TargetPart,
+    sensor_kind,
+    target_sensor,
+)
 from sim.vehicle_telemetry import VEHICLES, StandInSettings
 
 
@@ -41,6 +51,7 @@ def check(scenario: Scenario) -> None:
             f"{scenario.duration_s:g} s; shorten it with --set 'window_s=[0, {scenario.duration_s:g}]'"
         )
     recorded = scenario.world.kind == "recording"
+    spatial = recorded and scenario.world.format in SPATIAL_FORMATS
     if recorded and scenario.world.path is None:
         raise ConfigError(f"{scenario.name}: world.path is missing; add --set world.path=FOLDER of the recording")
     placement = scenario.world.placement
@@ -61,10 +72,11 @@ def check(scenario: Scenario) -> None:
     for robot in scenario.robots:
         _check_mover(f"{scenario.name}: robots.{robot.id}", robot)
         _check_autopilot(f"{scenario.name}: robots.{robot.id}", robot)
-        if recorded and LAYOUTS[robot.model].altitude is not None:
+        if recorded and (LAYOUTS[robot.model].altitude is not None) != spatial:
+            has, kind, other = ("no", "in space", "planar_altitude") if spatial else ("an", "planar", "unicycle")
             raise ConfigError(
-                f"{scenario.name}: robots.{robot.id}.model = '{robot.model}' has an altitude, and recordings are "
-                "planar; take 'unicycle'"
+                f"{scenario.name}: robots.{robot.id}.model = '{robot.model}' has {has} altitude, and recordings of "
+                f"format '{scenario.world.format}' are {kind}; take '{other}'"
             )
         scenario.lateness_of(robot)
         try:
@@ -102,10 +114,12 @@ def check(scenario: Scenario) -> None:
                 f"{scenario.name}: targets.{target.id}.recorded = {str(recorded).lower()} is needed in a "
                 f"{scenario.world.kind} world"
             )
-        if recorded and (LAYOUTS[target.model].heading is not None or LAYOUTS[target.model].dim != 4):
+        layout, axes = LAYOUTS[target.model], 3 if spatial else 2
+        if recorded and (layout.heading is not None or len(layout.position) != axes or layout.dim != 2 * axes):
+            suffix = "_3d" if spatial else ""
             raise ConfigError(
                 f"{scenario.name}: targets.{target.id}.model = '{target.model}' needs what nobody knows of a "
-                "recorded target; take 'damped_velocity' or 'constant_velocity'"
+                f"recorded target; take 'damped_velocity{suffix}' or 'constant_velocity{suffix}'"
             )
         if not recorded and target.start.pose is None:
             raise ConfigError(f"{scenario.name}: targets.{target.id}.start.pose is missing")

@@ -76,6 +76,10 @@ class World(Protocol):
         """True x, y, z (3,) at instant k; what is planar lies at z = 0."""
         ...
 
+    def sensors(self, robot: str) -> dict[str, SensorPart]:
+        """The sensors of a robot as they are: a recorded camera has its own mount and intrinsics."""
+        ...
+
     def outputs(self, k: int) -> list[Output]:
         """All data with instants in (k - 1, k], in order of (instant, phase, robot, subject)."""
         ...
@@ -191,6 +195,9 @@ class SimulatedWorld:
     def start_belief(self, entity: str) -> tuple[Array, Array]:
         part = self._scenario.movers()[entity]
         return start_belief(part, self._tracks[entity][0], self.seed)
+
+    def sensors(self, robot: str) -> dict[str, SensorPart]:
+        return next(part.sensors for part in self._scenario.robots if part.id == robot)
 
     def steer(self, robot: str, t_ns: int, steer: Steer) -> None:
         if self._loop is None:

@@ -33,7 +33,7 @@ def robot(scenario: Scenario, name: str) -> Any:
 
 @pytest.mark.parametrize("name", bundled())
 def test_every_bundled_scenario_loads(name: str) -> None:
-    scenario = load(name, ["world.path=/somewhere"] if name.startswith(("utias", "tiers")) else [])
+    scenario = load(name, ["world.path=/somewhere"] if name.startswith(("utias", "tiers", "drone")) else [])
     assert scenario.name == name
     assert scenario.window_s[1] <= scenario.duration_s
 
