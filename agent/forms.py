@@ -31,7 +31,7 @@ def build_filter(
     """The filter of `settings.localization`; of a robot that does not know where it is, one that waits for it.
 
     Who tracks by bearings of many has one that knows no targets, and a triangulator beside it. `saved`: what it begins
-    with, which is of the form of the settings (`agent.saved_state.decode`). The kind `replica` does not judge its peers.
+    with, which is of the form of the settings (`agent.saved_state.decode`). The kind `replica` judges no peer.
     """
     if settings.tracking.kind == "own" or not settings.track:
         return _localizing(settings, counters, count_nis, health, saved)

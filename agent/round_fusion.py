@@ -283,7 +283,9 @@ class RoundFusion:
                 moved = self._carrier.target(target, belief.belief, t_ns - item.t_ns)
                 yield peer, (Moment(t_ns, *moved), item.t_ns - belief.age_ns)
 
-    def _placed(self, target: str, before: Moment, t_ns: int, told: dict[str, Told[RoundReport]]) -> Iterator[tuple[str, Placed]]:
+    def _placed(
+        self, target: str, before: Moment, t_ns: int, told: dict[str, Told[RoundReport]]
+    ) -> Iterator[tuple[str, Placed]]:
         """By peer, where it places a target in x, y; the sensor's part counts as new once only.
 
         What is of a former round is in what neighbours who heard it in time believe now.

@@ -85,7 +85,8 @@ class Neighbours:
 
     def link_changed(self, event: LinkChange) -> bool:
         """Forget what a former life of a peer has told; whether there was one."""
-        return any([reports.link_changed(event) for reports in self._stages.values()])
+        changed = [reports.link_changed(event) for reports in self._stages.values()]
+        return any(changed)
 
     def newest(self, stage: RoundStage, t_ns: int) -> list[Told[RoundReport]]:
         """What is not too old at `t_ns`, in ascending order of peers."""

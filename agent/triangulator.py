@@ -18,6 +18,7 @@ from agent.effects import TrackEstimate
 from agent.estimation.bearing_filters import build
 from agent.estimation.direction import Directed
 from agent.estimation.gaussian import is_positive_definite
+from agent.estimation.motion import TargetMotion
 from agent.estimation.parallax import crosses
 from agent.estimation.sights import Sight, Told, refusal
 from agent.estimation.triangulation import BearingFilter, TrackState
@@ -35,6 +36,11 @@ PRECISE = ("kcf_plus", "icf_plus")
 
 UNCROSSED_NS = 5_000_000_000
 """A track is no longer made known when bearings have not crossed for so long: along the ray nothing is known then."""
+
+
+def density(motion: TargetMotion) -> float:
+    """Of the white acceleration [m^2/s^3] that a target is taken to have: the largest of its axes."""
+    return max(motion.noise_sigma) ** 2 * motion.noise_step_s
 
 
 @dataclass(slots=True, eq=False)
@@ -68,8 +74,7 @@ class Triangulator:
             return {"memory_s": tracking.memory_s}
         if tracking.kind not in PRECISE:
             return {}
-        sigma = max(target.motion.noise_sigma)
-        return {"q": sigma**2 * target.motion.noise_step_s}
+        return {"q": density(target.motion)}
 
     def __contains__(self, target: str) -> bool:
         return target in self._targets
@@ -145,7 +150,7 @@ class Triangulator:
             track.crossed_ns = t_ns
 
     def _begun(self, target: str, t_ns: int, place: Array) -> _Track:
-        """The track before the round at `t_ns`: of a prior that all have, or, as published, at the robot's own place."""
+        """The track before the round at `t_ns`: of a prior, if there is one, or, as published, at the own place."""
         settings, start_ns = self._targets[target], self._settings.start_ns
         if settings.mean is not None and self._settings.tracking.kind in PRECISE and t_ns > start_ns:
             return _Track(start_ns, TrackState(settings.mean, settings.cov), start_ns, start_ns)
