@@ -77,6 +77,9 @@ class _Covariance:
     gate: float = 3.0
     floor: float = 0.01
     lateness: float = 0.787
+    rounds: int = 3
+    ray: int = 1
+    each: int = 1
 
     def start(self, place: Array) -> TrackState:
         place = np.asarray(place, dtype=np.float64)
@@ -93,10 +96,25 @@ class _Covariance:
 
     def _seen(self, prior: TrackState, sights: Sights) -> TrackState:
         """A prior corrected by directions."""
-        S, y = _information(prior, sights, self)
-        cov = symmetrize(np.asarray(np.linalg.inv(np.linalg.inv(prior.matrix) + S)))
-        pull = y - (S @ prior.mean[..., None])[..., 0]
-        return TrackState(prior.mean + (cov @ pull[..., None])[..., 0], cov)
+        prior = self._begun(prior, sights)
+        known, mean = np.asarray(np.linalg.inv(prior.matrix)), prior.mean
+        for _ in range(int(self.rounds)):
+            S, y = _information(TrackState(mean, prior.matrix), sights, self)
+            cov = symmetrize(np.asarray(np.linalg.inv(known + S)))
+            pull = y - (S @ prior.mean[..., None])[..., 0]
+            mean = prior.mean + (cov @ pull[..., None])[..., 0]
+        return TrackState(mean, cov)
+
+    def _begun(self, prior: TrackState, sights: Sights) -> TrackState:
+        if not sights.used.shape[-1] or not self.ray:
+            return prior
+        least = np.linalg.eigvalsh(prior.matrix[..., :3, :3])[..., 0]
+        first = np.argmax(sights.used, axis=-1)[..., None, None]
+        begins = (least > (0.5 * self.start_m) ** 2) & sights.used.any(axis=-1)
+        place = np.take_along_axis(sights.place + self.start_m * sights.direction, first, axis=-2)[..., 0, :]
+        mean = prior.mean.copy()
+        mean[..., :3] = np.where(begins[..., None], place, mean[..., :3])
+        return TrackState(mean, prior.matrix)
 
 
 def _information(prior: TrackState, sights: Sights, of: _Covariance) -> tuple[Array, Array]:
@@ -106,10 +124,11 @@ def _information(prior: TrackState, sights: Sights, of: _Covariance) -> tuple[Ar
     g = sights.direction / np.linalg.norm(sights.direction, axis=-1)[..., None]
     # An observer that takes the target to be where itself is predicts no direction.
     h = np.where(away[..., None] > 0.0, from_there / np.maximum(away, 1e-12)[..., None], g)
-    r = np.clip(away, *of.ranges_m)
+    far = np.sqrt(away**2 + np.trace(prior.matrix[..., :3, :3], axis1=-2, axis2=-1)[..., None])
+    r = np.clip(far, *of.ranges_m)
     cosine = np.sum(h * g, axis=-1)
     angle = np.arctan2(np.linalg.norm(np.cross(h, g), axis=-1), cosine)
-    tangent = (_median(angle, sights.used) < of.tangent_rad)[..., None]
+    tangent = (angle < of.tangent_rad) if of.each else (_median(angle, sights.used) < of.tangent_rad)[..., None]
     P = projection(np.where(tangent[..., None], h, g))
     spread = np.trace(P @ prior.matrix[..., None, :3, :3], axis1=-2, axis2=-1) / 2.0
     off = angle / (of.gate * np.sqrt(sights.sigma**2 + spread / r**2))
@@ -118,7 +137,7 @@ def _information(prior: TrackState, sights: Sights, of: _Covariance) -> tuple[Ar
     N = across[..., None, None] * np.eye(3) + P @ sights.place_cov @ P
     W = counts[..., None, None] * (P @ np.linalg.inv(N) @ P)
     # Where the ray passes the prediction: on the tangent plane, or (pseudo-linear) any place of the ray.
-    ahead = sights.place + away[..., None] * h + r[..., None] * (g / np.maximum(cosine, SIDEWAYS)[..., None])
+    ahead = sights.place + away[..., None] * (g / np.maximum(cosine, SIDEWAYS)[..., None])
     return normal_equations(sights, W, np.where(tangent[..., None], ahead, sights.place))
 
 

@@ -7,7 +7,7 @@ the deviation per tangent axis is sigma / sqrt(3).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -54,7 +54,9 @@ class Faults:
     blackout: tuple[float, float] = (0.0, 0.0)
 
 
-MODERATE = Faults(loss=0.3, jitter=5, missed=0.2, false=0.05, place_m=0.5)
+NOMINAL = Faults()
+MODERATE = Faults(loss=0.3, jitter=2, missed=0.2, false=0.05, place_m=0.5)
+HEAVY = Faults(loss=0.3, jitter=5, missed=0.2, false=0.05, place_m=0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,11 @@ class World:
     came: NDArray[np.bool_]
     faults: Faults
     sigma: float = SIGMA
+
+    def only(self, trial: int) -> World:
+        """One trial of it."""
+        parts = ("told_places", "directions", "seen", "neighbours", "delays", "came")
+        return replace(self, **{name: getattr(self, name)[trial : trial + 1] for name in parts})
 
 
 @dataclass(eq=False)
@@ -126,23 +133,29 @@ def noisy(g: Array, sigma: float, rng: np.random.Generator) -> Array:
 
 
 def world(
-    seed: int, trials: int, kind: Course, fixed: bool, faults: Faults = Faults(), sigma: float = SIGMA, hears: int = 3
+    seed: int,
+    trials: int,
+    target: Course | Array,
+    fixed: bool,
+    faults: Faults = NOMINAL,
+    sigma: float = SIGMA,
+    noise: float | None = None,
 ) -> World:
-    """Layouts and directions depend on the seed alone, not on the faults."""
+    """Layouts and directions depend on the seed alone, not on the faults; `noise` is the true sigma if it is another."""
     rng, chance = np.random.default_rng([seed, 0]), np.random.default_rng([seed, 1])
-    truth = course(kind)
-    n = len(LAYOUT)
+    truth = course(target) if isinstance(target, str) else target
+    n, hears = len(LAYOUT), 3
     places = np.broadcast_to(LAYOUT, (trials, n, 3)) if fixed else BOX * (rng.uniform(size=(trials, n, 3)) - 0.5)
     away = truth[None, :, None, :3] - places[:, None]
-    directions = noisy(away / np.linalg.norm(away, axis=-1, keepdims=True), sigma, rng)
+    directions = noisy(away / np.linalg.norm(away, axis=-1, keepdims=True), sigma if noise is None else noise, rng)
     apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1)
     near = np.argsort(apart, axis=-1)[..., 1 : hears + 1]
-    shape = (trials, STEPS, n, hears)
+    shape = (trials, len(truth), n, hears)
     neighbours = np.broadcast_to(near[:, None], shape)
     if faults.rewire:
-        keys = chance.uniform(size=(trials, STEPS, n, n)) + 2.0 * np.eye(n)
+        keys = chance.uniform(size=(trials, len(truth), n, n)) + 2.0 * np.eye(n)
         neighbours = np.argsort(keys, axis=-1)[..., :hears]
-    seen = chance.uniform(size=(trials, STEPS, n)) >= faults.missed
+    seen = chance.uniform(size=(trials, len(truth), n)) >= faults.missed
     since, until = (round(at / DT) for at in faults.blackout)
     seen[:, since:until] = False
     wrong = chance.normal(size=directions.shape)
@@ -162,7 +175,7 @@ def play(made: World, kind: Kind, options: dict[str, float] | None = None, aware
     chosen = build(kind, options)
     trials, steps, n = made.seen.shape
     alone = kind in ("ckf", "central_plus")
-    place, row = made.told_places, np.arange(trials)[:, None]
+    place = made.told_places
     cov = EXACT + made.faults.place_m**2 * np.eye(3)
     sigma = made.sigma / np.sqrt(3.0)
     state = chosen.start(place.mean(axis=1, keepdims=True) if alone else place)
@@ -170,7 +183,6 @@ def play(made: World, kind: Kind, options: dict[str, float] | None = None, aware
     errors, nees = [], []
     for k in range(steps):
         own = Sight(place, made.directions[:, k], sigma, cov, 0.0, True, made.seen[:, k])
-        heard, told = [], []
         if alone:
             own_sights = [
                 Sight(place[:, i : i + 1], made.directions[:, k, i : i + 1], sigma, cov, 0.0, False, made.seen[:, k, i : i + 1])
@@ -179,19 +191,7 @@ def play(made: World, kind: Kind, options: dict[str, float] | None = None, aware
             state = chosen.step(state, DT, own_sights, [])
         else:
             sent.append(chosen.predicted(state, DT, [own]))
-            for m in range(made.neighbours.shape[-1]):
-                who, late = made.neighbours[:, k, :, m], made.delays[:, k, :, m]
-                there = made.came[:, k, :, m] & (late <= k)
-                when = np.maximum(k - late, 0)
-                age = DT * late if aware else 0.0
-                heard.append(
-                    Sight(place[row, who], made.directions[row, when, who], sigma, cov, age, False, there & made.seen[row, when, who])
-                )
-                mean = _at(sent, when, row, who, lambda item: item.mean)
-                covs = None
-                if sent[0].cov is not None:
-                    covs = _at(sent, when, row, who, lambda item: np.asarray(item.cov))
-                told.append(Told(mean, covs, age, there))
+            heard, told = _arrived(made, k, sent, cov, sigma, aware)
             state = chosen.step(state, DT, [own, *heard], told)
         mean, matrix = chosen.belief(state)
         error = mean - made.truth[k]
@@ -200,10 +200,34 @@ def play(made: World, kind: Kind, options: dict[str, float] | None = None, aware
     return Run(np.stack(errors, axis=1), np.stack(nees, axis=1))
 
 
-def _at(sent: list[Told], when: NDArray[np.int64], row: NDArray[np.int64], who: NDArray[np.int64], part) -> Array:
-    """What each (trial, robot) was told at a step of its own."""
-    latest = part(sent[-1])[row, who]
-    for step in np.unique(when):
-        chosen = when == step
-        latest[chosen] = part(sent[step])[row, who][chosen]
-    return latest
+def _arrived(
+    made: World, k: int, sent: list[Told], cov: Array, sigma: float, aware: bool
+) -> tuple[list[Sight], list[Told]]:
+    """Packets that arrive at step k: all sights, and of each neighbour the newest of what it told."""
+    row, links = np.arange(len(made.seen))[:, None], range(made.neighbours.shape[-1])
+    sights, told = [], []
+    for m in links:
+        newest: Told | None = None
+        for late in range(made.faults.delay, min(made.faults.delay + made.faults.jitter, k) + 1):
+            when = k - late
+            who = made.neighbours[:, when, :, m]
+            came = made.came[:, when, :, m] & (made.delays[:, when, :, m] == late)
+            age, place = DT * late if aware else 0.0, made.told_places[row, who]
+            seen = came & made.seen[:, when][row, who]
+            sights.append(Sight(place, made.directions[:, when][row, who], sigma, cov, age, False, seen))
+            then = sent[when]
+            item = Told(then.mean[row, who], None if then.cov is None else then.cov[row, who], age, came)
+            newest = item if newest is None else _newer(newest, item)
+        if newest is not None:
+            told.append(newest)
+    return sights, told
+
+
+def _newer(newest: Told, item: Told) -> Told:
+    """`newest` where something came, otherwise `item`."""
+    came = np.asarray(newest.used)
+    covs = None
+    if newest.cov is not None and item.cov is not None:
+        covs = np.where(came[..., None, None], newest.cov, item.cov)
+    mean = np.where(came[..., None], newest.mean, item.mean)
+    return Told(mean, covs, np.where(came, newest.age_s, item.age_s), came | item.used)
