@@ -69,14 +69,14 @@ class _Covariance:
     gate, floor        angle, in deviations, at which a direction counts a quarter; what it counts at least
     """
 
-    q: float = 3.0
+    q: float = 5.0
     start_m: float = 30.0
     start_mps: float = 5.0
     ranges_m: tuple[float, float] = (5.0, 100.0)
     tangent_rad: float = 0.5
     gate: float = 3.0
     floor: float = 0.01
-    lateness: float = 0.787
+    lateness: float = 0.6
     rounds: int = 3
     ray: int = 1
     each: int = 1
@@ -159,7 +159,7 @@ class MeanConsensus(_Covariance):
     tells_mean: ClassVar[bool] = True
     tells_cov: ClassVar[bool] = False
 
-    pull: float = 0.3
+    pull: float = 0.5
 
     def predicted(self, state: TrackState, dt: float, sights: Sequence[Sight] = ()) -> Told:
         return Told(moved(state.mean, dt))
