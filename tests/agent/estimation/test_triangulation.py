@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ from tests.agent.estimation.triangulation_world import (
     DT,
     LAYOUT,
     SIGMA,
-    STEPS,
     course,
     noisy,
     play,
@@ -65,7 +65,7 @@ def test_every_step_minimises_the_objective_over_the_horizon(late: float) -> Non
     seed, steps, c = 3, 12, 2.0
     seen, told = story(seed, steps)
     told = [[Told(item.mean) for item in at] for at in told]
-    seen = [[Sight(s.place, s.direction, s.sigma_rad, age_s=0.0 if s.own else late, own=s.own) for s in at] for at in seen]
+    seen = [[replace(s, age_s=0.0 if s.own else late) for s in at] for at in seen]
     chosen, r1 = Triangulation(), 10.0 * SIGMA**2
     f = chosen.forgetting(DT)
     state = chosen.start(seen[0][0].place)
@@ -201,8 +201,10 @@ def test_the_centralized_filter_is_a_kalman_filter_of_all_with_a_prior_of_n_robo
 
 
 def test_what_neighbours_are_told() -> None:
-    numbers = {kind: numbers_told(build(kind)) for kind in ("stt", "cmkf", "tkf", "cikf", "hcmci", "kcf_plus", "icf_plus")}
-    assert numbers == {"stt": 12, "cmkf": 6, "tkf": 6, "cikf": 27, "hcmci": 33, "kcf_plus": 12, "icf_plus": 33}
+    numbers: dict[Kind, int] = {
+        "stt": 12, "cmkf": 6, "tkf": 6, "cikf": 27, "hcmci": 33, "kcf_plus": 12, "icf_plus": 33
+    }  # fmt: skip
+    assert {kind: numbers_told(build(kind)) for kind in numbers} == numbers
     seen, told = story(2, 2)
     for kind in numbers:
         chosen = build(kind)

@@ -41,8 +41,9 @@ LAYOUT = np.array(
 
 @dataclass(frozen=True)
 class Faults:
-    """loss of a packet, delay in steps (fixed, plus uniformly up to `jitter`), missed and false detections, error of places
-    [m], three random neighbours at each step, nobody sees anything between two times [s]."""
+    """loss of a packet, delay in steps (fixed, and uniformly up to `jitter` more), missed and false detections, error
+    [m] of the places told, constant in a trial, three random neighbours at each step, nobody sees anything between two
+    times [s]."""
 
     loss: float = 0.0
     delay: int = 0
@@ -124,7 +125,7 @@ def _turned(velocity: Array, angle: float) -> Array:
 
 
 def noisy(g: Array, sigma: float, rng: np.random.Generator) -> Array:
-    """Directions (..., 3) turned as in the published simulation (Rodrigues' formula with an axis that is not normalised)."""
+    """Directions (..., 3) turned as in the published simulation (Rodrigues' formula, the axis not normalised)."""
     u = rng.normal(size=g.shape)
     axis = np.cross(g, u / np.linalg.norm(u, axis=-1, keepdims=True))
     angle = sigma * rng.normal(size=(*g.shape[:-1], 1))
@@ -141,7 +142,7 @@ def world(
     sigma: float = SIGMA,
     noise: float | None = None,
 ) -> World:
-    """Layouts and directions depend on the seed alone, not on the faults; `noise` is the true sigma if it is another."""
+    """Layouts and directions depend on the seed, not on the faults; `noise` is the true sigma if it is another."""
     rng, chance = np.random.default_rng([seed, 0]), np.random.default_rng([seed, 1])
     truth = course(target) if isinstance(target, str) else target
     n, hears = len(LAYOUT), 3
@@ -173,7 +174,7 @@ def play(made: World, kind: Kind, options: dict[str, float] | None = None, aware
     Centralized kinds have all directions at once.
     """
     chosen = build(kind, options)
-    trials, steps, n = made.seen.shape
+    steps, n = made.seen.shape[1:]
     alone = kind in ("ckf", "central_plus")
     place = made.told_places
     cov = EXACT + made.faults.place_m**2 * np.eye(3)
@@ -184,11 +185,11 @@ def play(made: World, kind: Kind, options: dict[str, float] | None = None, aware
     for k in range(steps):
         own = Sight(place, made.directions[:, k], sigma, cov, 0.0, True, made.seen[:, k])
         if alone:
-            own_sights = [
-                Sight(place[:, i : i + 1], made.directions[:, k, i : i + 1], sigma, cov, 0.0, False, made.seen[:, k, i : i + 1])
-                for i in range(n)
+            each = [slice(i, i + 1) for i in range(n)]
+            sights = [
+                Sight(place[:, i], made.directions[:, k, i], sigma, cov, 0.0, False, made.seen[:, k, i]) for i in each
             ]
-            state = chosen.step(state, DT, own_sights, [])
+            state = chosen.step(state, DT, sights, [])
         else:
             sent.append(chosen.predicted(state, DT, [own]))
             heard, told = _arrived(made, k, sent, cov, sigma, aware)
