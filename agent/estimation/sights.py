@@ -26,6 +26,9 @@ EXACT.flags.writeable = False
 LENGTHS = (0.5, 2.0)
 """A direction whose length is outside of these is none; noise that is added to a unit vector stays well inside."""
 
+APART_M = 1.0
+"""Distance from which on two places count as two."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
@@ -64,7 +67,7 @@ class Told:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sights:
-    """m sights in arrays: place, direction (..., m, 3), sigma, age (..., m), place_cov (..., m, 3, 3), used (..., m)."""
+    """m sights: place, direction (..., m, 3), sigma, age, used (..., m), place_cov (..., m, 3, 3), as of `Sight`."""
 
     place: Array
     direction: Array
@@ -101,6 +104,8 @@ def stack_sights(sights: Sequence[Sight], lead: tuple[int, ...]) -> Sights:
     place = _stacked([item.place for item in sights], lead, (3,))
     direction = _stacked([item.direction for item in sights], lead, (3,))
     sigma = _stacked([item.sigma_rad for item in sights], lead, ())
+    place_cov = _stacked([item.place_cov for item in sights], lead, (3, 3))
+    age = _stacked([item.age_s for item in sights], lead, ())
     length = np.linalg.norm(direction, axis=-1)
     fit = (length > LENGTHS[0]) & (length < LENGTHS[1]) & np.isfinite(place).all(axis=-1) & (sigma > 0.0)
     if not np.all(fit | ~used):
@@ -109,15 +114,9 @@ def stack_sights(sights: Sequence[Sight], lead: tuple[int, ...]) -> Sights:
         # What is masked may be any numbers, and must not turn sums into NaN.
         place = np.where(used[..., None], place, 0.0)
         direction = np.where(used[..., None], direction, np.array([0.0, 0.0, 1.0]))
-        sigma = np.where(used, sigma, 1.0)
-    return Sights(
-        place,
-        direction,
-        sigma,
-        _stacked([item.place_cov for item in sights], lead, (3, 3)),
-        _stacked([item.age_s for item in sights], lead, ()),
-        used,
-    )
+        sigma, age = np.where(used, sigma, 1.0), np.where(used, age, 0.0)
+        place_cov = np.where(used[..., None, None], place_cov, 0.0)
+    return Sights(place, direction, sigma, place_cov, age, used)
 
 
 def stack_told(told: Sequence[Told], lead: tuple[int, ...]) -> tuple[Array, Array | None, Array, Mask]:
@@ -141,6 +140,45 @@ def projection(direction: Array) -> Array:
     return np.asarray(np.eye(3) - direction[..., :, None] * direction[..., None, :])
 
 
+def crossing(sights: Sights, apart_m: float = APART_M) -> Array:
+    """How well directions cross (...): the smallest eigenvalue of the mean of P_g, from 0 (parallel) to 2/3.
+
+    Two rays at an angle a have (1 - |cos a|) / 2. Places closer than `apart_m` count as one, with their mean direction:
+    one observer crosses with nobody, however often it looks and however the target moves.
+    """
+    if sights.used.shape[-1] < 2:
+        return np.zeros(sights.used.shape[:-1])
+    between = np.linalg.norm(sights.place[..., :, None, :] - sights.place[..., None, :, :], axis=-1)
+    near = ((between < apart_m) & sights.used[..., :, None] & sights.used[..., None, :]).astype(np.float64)
+    mean = near @ sights.direction
+    mean /= np.maximum(np.linalg.norm(mean, axis=-1), np.finfo(float).tiny)[..., None]
+    weight = np.where(sights.used, 1.0 / np.maximum(near.sum(axis=-1), 1.0), 0.0)
+    weight /= np.maximum(weight.sum(axis=-1), np.finfo(float).tiny)[..., None]
+    along = (weight[..., None, None] * (mean[..., :, None] * mean[..., None, :])).sum(axis=-3)
+    found: Array = np.where(sights.used.any(axis=-1), 1.0 - np.linalg.eigvalsh(along)[..., -1], 0.0)
+    return found
+
+
+def observable(sights: Sequence[Sight], least: float = 0.002, noises: float = 16.0, apart_m: float = APART_M) -> Mask:
+    """Whether recent directions from separated places cross well enough for an estimate to be valid, (...).
+
+    `crossing` must be more than `least`, and more than `noises` times the mean variance of a direction: noise alone
+    makes two parallel rays seem to cross, by more than n s^2 with probability exp(-n). Two rays of 0.01 rad must cross
+    at 0.09 rad, of 0.06 rad at 0.48 rad. Pass what the last half second brought, which a slow target hardly moves in.
+    An estimate of which nothing crosses is a guess along a ray. Raises ValueError as a step does.
+    """
+    if not sights:
+        return np.asarray(False)
+    lead = np.broadcast_shapes(*(np.shape(item.place)[:-1] for item in sights))
+    return crosses(stack_sights(sights, lead), least, noises, apart_m)
+
+
+def crosses(sights: Sights, least: float = 0.002, noises: float = 16.0, apart_m: float = APART_M) -> Mask:
+    """`observable` of sights in arrays."""
+    variance = np.where(sights.used, sights.sigma**2, 0.0).sum(axis=-1) / np.maximum(sights.count(), 1.0)
+    return np.asarray(crossing(sights, apart_m) > np.maximum(least, noises * variance))
+
+
 def normal_equations(sights: Sights, weight: Array, towards: Array) -> tuple[Array, Array]:
     """Information S (..., 6, 6) and S x (..., 6) of places seen: sum of H^T W H, H^T W z with H = [I, -tau I].
 
@@ -157,11 +195,11 @@ def normal_equations(sights: Sights, weight: Array, towards: Array) -> tuple[Arr
     return S, np.concatenate([pull.sum(axis=-2), (back[..., None] * pull).sum(axis=-2)], axis=-1)
 
 
-def _stacked(values: Sequence[Array | float | bool], lead: tuple[int, ...], shape: tuple[int, ...]) -> Array:
+def _stacked(values: Sequence[Array | Mask | float], lead: tuple[int, ...], shape: tuple[int, ...]) -> Array:
     """Values that broadcast to (*lead, *shape) as one array (*lead, m, *shape)."""
     if not lead:
         return np.array(values, dtype=np.float64).reshape(len(values), *shape)
-    found = np.empty((*lead, len(values), *shape))
+    found = np.empty((len(values), *lead, *shape))
     for index, value in enumerate(values):
-        found[(*(slice(None),) * len(lead), index)] = value
-    return found
+        found[index] = value
+    return np.moveaxis(found, 0, len(lead))

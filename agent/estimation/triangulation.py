@@ -1,6 +1,6 @@
 """Spatial-temporal triangulation (STT 2023) and the distributed filters it was compared with, as published.
 
-All take a direction as a pseudo-linear measurement z = P_g s = P_g p + noise whose noise is said to be the same at every
+All take a direction as a pseudo-linear measurement z = P_g s = P_g p + noise whose noise is said to be the same at any
 range, R = r1 I with r1 = scale * sigma^2: `scale` is what the published simulations were tuned to. Their sigma is the
 deviation of a rotation about an axis g x u, u random of unit length, which is not normalised: sqrt(3) times the
 deviation per tangent axis, so here r1 = 3 scale sigma_rad^2.
@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from agent.estimation.sights import Sight, Sights, Told, normal_equations, projection, stack_sights, stack_told
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 AXIS_SHARE = 3.0
 """(published sigma / sigma per tangent axis)^2."""
@@ -41,7 +42,7 @@ FLATTEST = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackState:
-    """What a filter keeps: mean (..., 6), and matrix (..., 6, 6): the information of `stt`, the covariance of others."""
+    """What a filter keeps: mean (..., 6), matrix (..., 6, 6), which is the information of `stt`, others' covariance."""
 
     mean: Array
     matrix: Array
@@ -63,7 +64,7 @@ class BearingFilter(Protocol):
         ...
 
     def predicted(self, state: TrackState, dt: float, sights: Sequence[Sight] = ()) -> Told:
-        """What neighbours are told at the instant dt [s] after `state`; of `sights`, only own ones are used, by `cikf`."""
+        """What neighbours are told at the instant dt [s] after `state`; `cikf` uses the own ones of `sights` for it."""
         ...
 
     def step(self, state: TrackState, dt: float, sights: Sequence[Sight], told: Sequence[Told]) -> TrackState:
@@ -126,7 +127,7 @@ def _times(matrix: Array, vector: Array) -> Array:
     return np.asarray((matrix @ vector[..., None])[..., 0])
 
 
-def _mean_of(values: Array, used: Array, own: Array | None = None) -> Array:
+def _mean_of(values: Array, used: Mask, own: Array | None = None) -> Array:
     """Mean (..., n) of the used ones of (..., m, n) and `own` (..., n), which is there always."""
     total = (used[..., None] * values).sum(axis=-2)
     count = used.sum(axis=-1)[..., None].astype(np.float64)
