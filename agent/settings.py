@@ -203,12 +203,13 @@ class TrackingSettings:
     round (`agent.triangulator`).
 
     memory_s      time in which what is known fades to 1 / e, of the kind `stt`; None: as published
-    parallax_rad  a place is told once bearings cross by so much; 0: from the first one on
+    parallax_rad  a place is told once bearings cross by so much, and by more than noise may make them seem to; 0: from the
+                  first one on
     """
 
     kind: Literal["own", "stt", "cmkf", "cikf", "hcmci", "tkf", "kcf_plus", "icf_plus"] = "own"
     memory_s: float | None = None
-    parallax_rad: float = 0.2
+    parallax_rad: float = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -37,7 +37,7 @@ class TrackingPart(Part):
 
     kind: Literal["clat", "stt", "cmkf", "cikf", "hcmci", "tkf", "kcf_plus", "icf_plus", "none"] = "clat"
     memory_s: Positive | None = None
-    parallax_rad: Annotated[float, Field(ge=0.0, lt=1.5)] = 0.2
+    parallax_rad: Annotated[float, Field(ge=0.0, lt=1.5)] = 0.1
     start_within_m: Positive | None = None
     end_after_s: Positive | None = None
     end_above_m: Positive | None = None

@@ -7,6 +7,7 @@ round, at its own age, and once. A track is made known only once bearings of sev
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,8 +20,7 @@ from agent.estimation.bearing_filters import build
 from agent.estimation.direction import Directed
 from agent.estimation.gaussian import is_positive_definite
 from agent.estimation.motion import TargetMotion
-from agent.estimation.parallax import crosses
-from agent.estimation.sights import Sight, Told, refusal
+from agent.estimation.sights import Sight, Told, observable, refusal
 from agent.estimation.triangulation import BearingFilter, TrackState
 from agent.peer_tables import remember
 from agent.plausible import FARTHEST
@@ -33,6 +33,9 @@ Array = NDArray[np.float64]
 
 PRECISE = ("kcf_plus", "icf_plus")
 """Kinds that keep a covariance, know how the target's noise is stated, and can begin with a prior."""
+
+RECENT_S = 0.5
+"""A target hardly moves meanwhile, so that bearings of a moment ago cross those of now where it is."""
 
 UNCROSSED_NS = 5_000_000_000
 """A track is no longer made known when bearings have not crossed for so long: along the ray nothing is known then."""
@@ -144,9 +147,7 @@ class Triangulator:
             return
         track.state, track.t_ns = state, t_ns
         self._counters["round.used_bearings"] += len(sights)
-        tracking = self._settings.tracking
-        simultaneous = [item for item in sights if float(item.age_s) <= 2e-9 * self._settings.round.period_ns]
-        if tracking.parallax_rad == 0.0 or crosses(simultaneous, tracking.parallax_rad):
+        if self._crossing(sights):
             track.crossed_ns = t_ns
 
     def _begun(self, target: str, t_ns: int, place: Array) -> _Track:
@@ -156,6 +157,12 @@ class Triangulator:
             return _Track(start_ns, TrackState(settings.mean, settings.cov), start_ns, start_ns)
         before_ns = t_ns - self._settings.round.period_ns
         return _Track(before_ns, self._filters[target].start(place), before_ns)
+
+    def _crossing(self, sights: list[Sight]) -> bool:
+        """Whether bearings of about now tell a place."""
+        parallax = self._settings.tracking.parallax_rad
+        recent = [item for item in sights if float(item.age_s) <= RECENT_S]
+        return parallax == 0.0 or bool(observable(recent, 1.0 - math.cos(parallax)))
 
     @staticmethod
     def _sane(state: TrackState) -> bool:
