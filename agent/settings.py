@@ -203,8 +203,7 @@ class TrackingSettings:
     round (`agent.triangulator`).
 
     memory_s      time in which what is known fades to 1 / e, of the kind `stt`; None: as published
-    parallax_rad  a place is told once bearings cross by so much, and by more than noise may make them seem to; 0: from the
-                  first one on
+    parallax_rad  a place is told once bearings cross by so much, and more than noise may make them seem to; 0: at once
     """
 
     kind: Literal["own", "stt", "cmkf", "cikf", "hcmci", "tkf", "kcf_plus", "icf_plus"] = "own"

@@ -161,8 +161,12 @@ class Triangulator:
     def _crossing(self, sights: list[Sight]) -> bool:
         """Whether bearings of about now tell a place."""
         parallax = self._settings.tracking.parallax_rad
-        recent = [item for item in sights if float(item.age_s) <= RECENT_S]
-        return parallax == 0.0 or bool(observable(recent, 1.0 - math.cos(parallax)))
+        if parallax == 0.0:
+            return True
+        recent = sorted((it for it in sights if float(it.age_s) <= RECENT_S), key=lambda it: float(it.sigma_rad))
+        least = 0.5 * (1.0 - math.cos(parallax))
+        # Who hardly knows its heading takes nothing from the others.
+        return any(bool(observable(recent[:count], least)) for count in range(len(recent), 1, -1))
 
     @staticmethod
     def _sane(state: TrackState) -> bool:

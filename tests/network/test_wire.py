@@ -163,7 +163,8 @@ def example_round() -> RoundReport:
 def example_bearings() -> BearingReport:
     """A camera that has seen one target and expects another one somewhere."""
     seen = Bearing("t1", np.array([1.0, -2.0, 0.5]), np.diag([0.25, 0.25, 0.0]), np.array([0.6, 0.0, 0.8]), 0.125, 90)
-    return BearingReport((seen,), (Prediction("t1", np.arange(6.0), 2.0 * np.eye(6)), Prediction("t2", -np.arange(6.0))))
+    told = Prediction("t1", np.arange(6.0), 2.0 * np.eye(6)), Prediction("t2", -np.arange(6.0))
+    return BearingReport((seen,), told)
 
 
 EXAMPLES: dict[str, Body] = {
