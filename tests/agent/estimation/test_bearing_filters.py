@@ -65,8 +65,8 @@ def test_one_direction_is_an_extended_kalman_update_of_two_angles(kind: Kind) ->
     H = np.hstack([axes, -late * axes])
     K = prior @ H.T @ np.linalg.inv(H @ prior @ H.T + R)
     z = axes @ g * distance / (unit(expected) @ g)
-    assert np.allclose(found.mean, mean + K @ z, atol=1e-9)
-    assert np.allclose(found.matrix, prior - K @ H @ prior, atol=1e-9)
+    assert np.allclose(found.mean, mean + K @ z, rtol=0.0, atol=1e-9)
+    assert np.allclose(found.matrix, prior - K @ H @ prior, rtol=0.0, atol=1e-9)
 
 
 def test_mean_consensus_moves_half_way_and_claims_nothing() -> None:
@@ -170,7 +170,7 @@ def test_a_team_that_lost_the_target_finds_it_again() -> None:
     places, row = made.told_places, np.arange(10)[:, None]
     mean = np.broadcast_to(made.truth[0] + off, (10, 10, 6))
     state = TrackState(mean, np.broadcast_to(np.eye(6), (10, 10, 6, 6)))
-    for k in range(50):
+    for k in range(16):
         told, sights = chosen.predicted(state, DT), [Sight(places, made.directions[:, k], 0.0577, own=True)]
         others = []
         for m in range(3):
@@ -179,5 +179,6 @@ def test_a_team_that_lost_the_target_finds_it_again() -> None:
             assert told.cov is not None
             others.append(replace(told, mean=told.mean[row, who], cov=told.cov[row, who]))
         state = chosen.step(state, DT, sights, others)
-    errors = np.linalg.norm(state.mean[..., :3] - made.truth[49, :3], axis=-1)
-    assert np.sqrt(np.mean(errors**2)) < 1.5
+    errors = np.linalg.norm(state.mean[..., :3] - made.truth[15, :3], axis=-1)
+    # It takes twice as long if the prediction is never doubted.
+    assert np.sqrt(np.mean(errors**2)) < 5.0
