@@ -271,6 +271,7 @@ class Scenario(Part):
     name: Id
     duration_s: Positive
     step_s: Positive
+    sample_s: Positive = 1.0
     window_s: Vector2
     lost_above_m: Positive = 8.0
     collision_m: Positive = 2.0
