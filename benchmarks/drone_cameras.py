@@ -4,7 +4,8 @@ At every row of the truth (5 Hz) the pixels of each camera are interpolated to i
 errors of the truth, and errors of the places that lie nearest to the rays of all cameras that see the drone then, in
 the sense of least squares, where two or more do. Poses and clock were fitted to the same truth (see
 `sim.recordings.drone_cameras`), so that this is a figure of the data, not of a method; a tracker has to be better.
-With `--filter`, errors of the centralized filter of the scenario `drone-cameras` are printed beside (a minute).
+With `--filter`, errors of the centralized filter of the scenario `drone-cameras` are printed beside (a minute), with
+`--tracks` those of the tracks that the cameras of that scenario tell, with the mean NEES of their places (minutes).
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from numpy.typing import NDArray
 
 from agent.config_file import ConfigError
 from agent.estimation.mounting import rotation
-from sim.bound import BoundRunner
+from sim.bearing_bound import bound_of
 from sim.recordings.drone_cameras import STEP_NS, TARGET, load
 from sim.recordings.recording import Recording, RecordingError
 from sim.scenario_file import load as load_scenario
-from sim.trial import open_world
+from sim.trial import open_world, run_trial
 
 Array = NDArray[np.float64]
 
@@ -103,14 +104,25 @@ def filtered(folder: str, overrides: Sequence[str] = ()) -> Array:
     """Errors [m] (E,) of the centralized filter of the scenario `drone-cameras` at the instants of the truth."""
     scenario = load_scenario("drone-cameras", [f"world.path={folder}", *overrides])
     world = open_world(scenario, 1)
-    if world.step_ns != STEP_NS:
-        raise ConfigError(f"step_s = {world.step_ns * 1e-9:g} is not the step of the truth; leave it at 0.2")
-    runner, errors = BoundRunner(scenario, world), np.full(world.steps + 1, np.nan)
+    if STEP_NS % world.step_ns:
+        raise ConfigError(f"step_s = {world.step_ns * 1e-9:g} does not divide that of the truth; leave it at 0.1")
+    runner, stride = bound_of(scenario, world), STEP_NS // world.step_ns
+    errors = np.full(world.steps // stride + 1, np.nan)
     for k in range(1, world.steps + 1):
         runner.step(k, world.outputs(k))
-        if (belief := runner.belief(TARGET)) is not None:
-            errors[k] = np.linalg.norm(belief[0][:3] - world.place(TARGET, k))
+        if k % stride == 0 and (belief := runner.belief(TARGET)) is not None:
+            errors[k // stride] = np.linalg.norm(belief[0][:3] - world.place(TARGET, k))
     return errors
+
+
+def told(folder: str, overrides: Sequence[str] = ()) -> tuple[Array, Array]:
+    """Errors [m] and NEES per degree of freedom of the place, (cameras, E), of what each camera tells of the drone."""
+    scenario = load_scenario("drone-cameras", [f"world.path={folder}", *overrides])
+    tracks = run_trial(scenario, 1).trace.targets[TARGET].values()
+    away = np.array([(track.mean - track.truth)[:, :3] for track in tracks])
+    covs = np.array([track.cov[:, :3, :3] for track in tracks])
+    scaled = (away[..., None, :] @ np.linalg.solve(covs, away[..., None]))[..., 0, 0] / 3.0
+    return np.linalg.norm(away, axis=-1), scaled
 
 
 def table(recording: Recording) -> str:
@@ -142,6 +154,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.drone_cameras", description=__doc__)
     parser.add_argument("folder", help="dataset3 of the drone tracking set, with the folder calibration beside it")
     parser.add_argument("--filter", action="store_true", help="with errors of the centralized filter")
+    parser.add_argument("--tracks", action="store_true", help="with errors of what cameras tell each other")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of its scenario")
     options = parser.parse_args(arguments)
     try:
@@ -150,6 +163,13 @@ def main(arguments: list[str] | None = None) -> int:
         if options.filter:
             error_m = filtered(options.folder, options.set)
             print("\nCentralized filter\n\n" + errors_table(located(recording).cameras[: len(error_m)], error_m))
+        if options.tracks:
+            error_m, scaled = told(options.folder, options.set)
+            cameras = np.broadcast_to(located(recording).cameras[: error_m.shape[1]], error_m.shape)
+            print("\nTracks of all cameras\n\n" + errors_table(cameras.ravel(), error_m.ravel()))
+            known, several = np.isfinite(error_m), cameras >= 2
+            share, anees = known[several].mean(), scaled[known & several].mean()
+            print(f"\n{share:.3f} of the instants with two cameras have a track; ANEES there {anees:.2f}")
     except (RecordingError, ConfigError) as error:
         print(error, file=sys.stderr)
         return 2
