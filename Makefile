@@ -54,10 +54,10 @@ check-long: setup check-fuzz check-matrix
 check-matrix: setup
 	COFIX_MATRIX=1 $(BIN)/python -P -m pytest -s --durations=0 tests/deploy/test_fault_matrix.py tests/deploy/test_namespaces.py
 
-# make check-data UTIAS7=FOLDER [TIERS=FOLDER]: the tests on recorded data, which is not part of the repository.
+# make check-data UTIAS7=FOLDER [TIERS=FOLDER] [DRONES=FOLDER]: the tests on recorded data, which is not part of the repository.
 check-data: setup
-	@test -n "$(UTIAS7)$(TIERS)" || { echo "check-data: give UTIAS7=FOLDER of MRCLAM_Dataset7, or TIERS=FOLDER of the UWB bags"; exit 2; }
-	COFIX_UTIAS7="$(UTIAS7)" COFIX_TIERS="$(TIERS)" $(BIN)/python -P -m pytest tests/sim/test_utias.py tests/sim/test_utias_acceptance.py tests/deploy/test_utias_processes.py tests/sim/test_tiers.py
+	@test -n "$(UTIAS7)$(TIERS)$(DRONES)" || { echo "check-data: give UTIAS7=FOLDER of MRCLAM_Dataset7, TIERS=FOLDER of the UWB bags, or DRONES=FOLDER, dataset3 of the drone tracking set"; exit 2; }
+	COFIX_UTIAS7="$(UTIAS7)" COFIX_TIERS="$(TIERS)" COFIX_DRONES="$(DRONES)" $(BIN)/python -P -m pytest tests/sim/test_utias.py tests/sim/test_utias_acceptance.py tests/deploy/test_utias_processes.py tests/sim/test_tiers.py tests/sim/test_drone_cameras.py
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

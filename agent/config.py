@@ -242,6 +242,7 @@ class AgentConfig(Part):
             unsafe=unsafe,
             coast=coast,
             track=self.tracking.kind != "none",
+            tracking=self.tracking.settings(),
             team=tuple(member.settings() for member in self.team),
             track_end=self.tracking.end(),
             track_within_m=self.tracking.start_within_m,
@@ -281,6 +282,7 @@ def load_agent_config(path: Path) -> AgentConfig:
     try:
         config.localization.settings()
         config.tracking.check_kind(config.localization, [t.id for t in config.targets if t.mean is None])
+        config.tracking.check_targets([(target.id, target.model) for target in config.targets])
         if config.localization.form == "joint":
             followed = config.targets if config.tracking.kind != "none" else []
             check_room(LAYOUTS[config.motion.model], [(target.id, LAYOUTS[target.model]) for target in followed])

@@ -40,7 +40,7 @@ PROTECTED = UnsafeSettings()
 
 
 class LocalizationPart(Part):
-    kind: Literal["clat", "replica", "jlatt"] = "clat"
+    kind: Literal["clat", "replica", "jlatt", "fixed"] = "clat"
     form: Literal["auto", "split_joint", "safe", "published", "joint"] = "auto"
     transform: Literal["unscented", "linearized", "jacobian"] | None = None
     correlation: Literal["factors", "ignored"] = "factors"
@@ -59,6 +59,8 @@ class LocalizationPart(Part):
         """
         if self.kind != "jlatt":
             self._refuse("weights", "jlatt", f"kind '{self.kind}' has no rounds")
+        if self.kind == "fixed":
+            self._refuse("innovation_cap", "clat", "kind 'fixed' has no innovations")
         if self.kind != "clat":
             for key in ("form", "correlation", "pair_interval_s"):
                 self._refuse(key, "clat", f"kind '{self.kind}' has no contacts of pairs")
@@ -171,16 +173,27 @@ class NetworkPart(Part):
 
 
 class LinksPart(Part):
-    """Link model. `range_m` absent: everybody hears everybody."""
+    """Link model. `range_m` absent: everybody hears everybody.
+
+    A robot hears only the `nearest` senders in range, or `rewire` of them drawn anew at every step of the world.
+    """
 
     range_m: Positive | None = None
     hysteresis_m: NotNegative = 0.0
+    nearest: Annotated[int, Field(ge=1)] | None = None
+    rewire: Annotated[int, Field(ge=1)] | None = None
     loss: Share = 0.0
     delay_s: NotNegative = 0.0
     delay_tail_s: NotNegative = 0.0
     duplicate: Share = 0.0
 
     def settings(self, seed: int) -> LinkSettings:
+        """Raises `ConfigError` if senders are chosen in two ways."""
+        if self.nearest is not None and self.rewire is not None:
+            raise ConfigError(
+                "links.nearest and links.rewire both choose who is heard; state one, as "
+                f"links = {{ rewire = {self.rewire} }}"
+            )
         return LinkSettings(seed=seed, **self.model_dump())
 
 

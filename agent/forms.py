@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 
 from agent.auto_filter import AutoFilter
 from agent.cooperative_filter import CooperativeFilter
 from agent.factor_filter import FactorFilter
+from agent.fixed_filter import FixedFilter
 from agent.health import Health
 from agent.jlatt_filter import JlattFilter
 from agent.joint_filter import JointFilter
@@ -15,6 +17,7 @@ from agent.replica_filter import ReplicaFilter
 from agent.saved_state import Saved, SavedFactors, SavedSplit
 from agent.settings import AgentSettings
 from agent.split_filter import SplitFilter
+from agent.triangulating_filter import TriangulatingFilter
 from agent.waiting_filter import WaitingFilter
 
 
@@ -27,9 +30,24 @@ def build_filter(
 ) -> CooperativeFilter:
     """The filter of `settings.localization`; of a robot that does not know where it is, one that waits for it.
 
-    `saved`: what it begins with, which is of the form of the settings (`agent.saved_state.decode`).
-    The kind `replica` does not judge its peers.
+    Who tracks by bearings of many has one that knows no targets, and a triangulator beside it. `saved`: what it begins
+    with, which is of the form of the settings (`agent.saved_state.decode`). The kind `replica` judges no peer.
     """
+    if settings.tracking.kind == "own" or not settings.track:
+        return _localizing(settings, counters, count_nis, health, saved)
+    own = _localizing(replace(settings, track=False), counters, count_nis, health, saved)
+    return own if isinstance(own, WaitingFilter) else TriangulatingFilter(own, settings, counters)
+
+
+def _localizing(
+    settings: AgentSettings,
+    counters: Counter[str],
+    count_nis: Callable[[str, float], None],
+    health: Health,
+    saved: Saved | None,
+) -> CooperativeFilter:
+    if settings.localization.kind == "fixed" and settings.source == "survey":
+        return FixedFilter(settings, counters, saved if isinstance(saved, SavedSplit) else None)
     if isinstance(saved, SavedFactors):
         kept = JointFilter if settings.localization.form == "joint" else FactorFilter
         return kept(settings, counters, count_nis, saved, health=health)

@@ -136,7 +136,7 @@ class Pilot:
     # -- what is known --------------------------------------------------------------------------------------
 
     def _situation(self, t_ns: int, index: int, estimate: Estimate) -> Situation:
-        newest: dict[str, Told] = {}
+        newest: dict[str, Told[RoundReport]] = {}
         for stage in RoundStage:
             for told in self._neighbours.newest(stage, t_ns):
                 if told.peer not in newest or told.t_ns >= newest[told.peer].t_ns:

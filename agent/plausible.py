@@ -16,6 +16,7 @@ from agent.estimation.gaussian import quadratic_form, wrap_components
 from agent.estimation.motion import STATES
 from agent.settings import HealthSettings
 from network.messages import (
+    BearingReport,
     Body,
     JointSnapshot,
     PairReply,
@@ -40,6 +41,8 @@ def plausible(body: Body) -> bool:
     """Whether what a peer tells of itself and of targets can be so; of a body without beliefs it always can."""
     if isinstance(body, RoundReport):
         return _round_possible(body)
+    if isinstance(body, BearingReport):
+        return _bearings_possible(body)
     if not isinstance(body, PairRequest | PairReply | SplitRequest | SplitReply) or body.snapshot is None:
         return True
     return all(_possible(*part) for part in _beliefs(body.snapshot))
@@ -50,6 +53,14 @@ def _round_possible(report: RoundReport) -> bool:
     corrections = ((item.place, (item.sensor + item.pose).diagonal()) for item in report.corrections)
     return all(_possible(belief.model, belief.mean, belief.cov.diagonal()) for belief in beliefs) and all(
         np.abs(place).max() <= FARTHEST and variances.min() >= SUREST for place, variances in corrections
+    )
+
+
+def _bearings_possible(report: BearingReport) -> bool:
+    variances = (item.cov.diagonal()[:3] for item in report.predictions if item.cov is not None)
+    numbers = [item.place for item in report.bearings] + [item.mean for item in report.predictions]
+    return all(np.abs(found).max() <= FARTHEST for found in numbers) and all(
+        found.min() >= SUREST for found in variances
     )
 
 

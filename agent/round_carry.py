@@ -11,7 +11,7 @@ from agent.estimation.jlatt import Placed
 from agent.estimation.motion import STATES, TargetMotion
 from agent.rounds import Told
 from agent.settings import AgentSettings
-from network.messages import Belief
+from network.messages import Belief, RoundReport
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ class Carrier:
     def _seconds(self, age_ns: int) -> float:
         return 0.0 if abs(age_ns) <= self._tolerance_ns else age_ns * 1e-9
 
-    def belief(self, told: Told, t_ns: int) -> Belief:
+    def belief(self, told: Told[RoundReport], t_ns: int) -> Belief:
         """A peer's belief of its pose at `t_ns`."""
         report, age_s = told.report, self._seconds(t_ns - told.t_ns)
         if age_s == 0.0:

@@ -28,7 +28,7 @@ from agent.round_tracks import RoundTracks
 from agent.rounds import Told
 from agent.settings import AgentSettings
 from agent.tracks import CONTRADICTIONS
-from network.messages import Correction, Measurement
+from network.messages import Correction, Measurement, RoundReport
 
 Array = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ class RoundFusion:
         """A peer has begun anew."""
         self._used.pop(peer, None)
 
-    def usable(self, told: list[Told], t_ns: int) -> dict[str, Told]:
+    def usable(self, told: list[Told[RoundReport]], t_ns: int) -> dict[str, Told[RoundReport]]:
         """By peer, what may be used at `t_ns` under the policy for what is late."""
         unsafe, lateness = self._settings.unsafe, self._settings.lateness
         if unsafe.use_late_as_new:
@@ -93,7 +93,7 @@ class RoundFusion:
         tracks: RoundTracks,
         detected: dict[str, Detected],
         seen: dict[str, Seen],
-        told: dict[str, Told],
+        told: dict[str, Told[RoundReport]],
     ) -> None:
         """Use what was seen since the last round, in order of its instants."""
         instants = {item.t_ns for item in detected.values()} | {item.t_ns for item in seen.values()}
@@ -127,7 +127,7 @@ class RoundFusion:
             self._counters["update.failed"] += 1
 
     def _of_peers(
-        self, then: Moment, t_ns: int, detected: dict[str, Detected], told: dict[str, Told]
+        self, then: Moment, t_ns: int, detected: dict[str, Detected], told: dict[str, Told[RoundReport]]
     ) -> Iterator[Detection]:
         for peer, item in sorted(detected.items()):
             if item.t_ns != t_ns:
@@ -207,7 +207,7 @@ class RoundFusion:
         t_ns: int,
         corrections: dict[str, Correction],
         seen: dict[str, Seen],
-        told: dict[str, Told],
+        told: dict[str, Told[RoundReport]],
     ) -> None:
         """Use what all believe of each target at `t_ns`, and where all place it."""
         trusted = {peer: item for peer, item in told.items() if self._health.trusts(peer)}
@@ -224,7 +224,7 @@ class RoundFusion:
         t_ns: int,
         correction: Correction | None,
         seen: Seen | None,
-        told: dict[str, Told],
+        told: dict[str, Told[RoundReport]],
     ) -> None:
         layout = tracks.layout(target)
         beliefs = dict(self._beliefs(target, layout, t_ns, told))
@@ -270,7 +270,7 @@ class RoundFusion:
             self._counters["update.not_positive_definite"] += 1
 
     def _beliefs(
-        self, target: str, layout: StateLayout, t_ns: int, told: dict[str, Told]
+        self, target: str, layout: StateLayout, t_ns: int, told: dict[str, Told[RoundReport]]
     ) -> Iterator[tuple[str, tuple[Moment, int]]]:
         """By peer, what it believes of a target at `t_ns`, and when something was last learnt of it."""
         for peer, item in told.items():
@@ -283,7 +283,9 @@ class RoundFusion:
                 moved = self._carrier.target(target, belief.belief, t_ns - item.t_ns)
                 yield peer, (Moment(t_ns, *moved), item.t_ns - belief.age_ns)
 
-    def _placed(self, target: str, before: Moment, t_ns: int, told: dict[str, Told]) -> Iterator[tuple[str, Placed]]:
+    def _placed(
+        self, target: str, before: Moment, t_ns: int, told: dict[str, Told[RoundReport]]
+    ) -> Iterator[tuple[str, Placed]]:
         """By peer, where it places a target in x, y; the sensor's part counts as new once only.
 
         What is of a former round is in what neighbours who heard it in time believe now.

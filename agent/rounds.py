@@ -8,11 +8,14 @@ next one, with what it told carried there (`agent.estimation.jlatt`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from agent.events import LinkChange
 from agent.peer_tables import remember
 from agent.settings import RoundSettings
 from network.messages import RoundReport, RoundStage
+
+Report = TypeVar("Report")
 
 PRESENT_ROUNDS = 2
 """Who was silent for so many rounds is not waited for."""
@@ -22,29 +25,30 @@ OLDEST_ROUNDS = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
+class Told(Generic[Report]):
     """A report and the instant it is of, on the own clock."""
 
     peer: str
     t_ns: int
-    report: RoundReport
+    report: Report
 
 
-class Neighbours:
-    """The newest report of each peer and stage."""
+class Reports(Generic[Report]):
+    """The newest report of each peer."""
 
-    def __init__(self, settings: RoundSettings) -> None:
+    def __init__(self, settings: RoundSettings, oldest_ns: int | None = None) -> None:
+        """`oldest_ns`: how old a report may be to be of use; None: `OLDEST_ROUNDS`."""
         self._settings = settings
+        self._oldest_ns = OLDEST_ROUNDS * settings.period_ns if oldest_ns is None else oldest_ns
         self._lives: dict[str, tuple[int, int]] = {}
-        self._told: dict[RoundStage, dict[str, Told]] = {stage: {} for stage in RoundStage}
+        self._told: dict[str, Told[Report]] = {}
 
-    def hear(self, told: Told) -> bool:
+    def hear(self, told: Told[Report]) -> bool:
         """Keep a report; False if a newer one is known."""
-        table = self._told[told.report.stage]
-        last = table.get(told.peer)
+        last = self._told.get(told.peer)
         if last is not None and last.t_ns >= told.t_ns:
             return False
-        remember(table, told.peer, told)
+        remember(self._told, told.peer, told)
         return True
 
     def link_changed(self, event: LinkChange) -> bool:
@@ -53,21 +57,44 @@ class Neighbours:
         if not event.up or self._lives.get(event.peer) == life:
             return False
         remember(self._lives, event.peer, life)
-        for table in self._told.values():
-            table.pop(event.peer, None)
+        self._told.pop(event.peer, None)
         return True
 
-    def newest(self, stage: RoundStage, t_ns: int) -> list[Told]:
+    def newest(self, t_ns: int) -> list[Told[Report]]:
         """What is not too old at `t_ns`, in ascending order of peers."""
-        oldest = t_ns - OLDEST_ROUNDS * self._settings.period_ns
-        return [told for _, told in sorted(self._told[stage].items()) if told.t_ns >= oldest]
+        oldest = t_ns - self._oldest_ns
+        return [told for _, told in sorted(self._told.items()) if told.t_ns >= oldest]
 
-    def all_told(self, stage: RoundStage, t_ns: int) -> bool:
+    def all_told(self, t_ns: int) -> bool:
         """Whether everybody who told lately has told of the round at `t_ns`; nobody else is waited for."""
         near = t_ns - self._settings.period_ns // 2
         lately = t_ns - PRESENT_ROUNDS * self._settings.period_ns
-        stamps = [told.t_ns for told in self._told[stage].values() if told.t_ns >= lately]
+        stamps = [told.t_ns for told in self._told.values() if told.t_ns >= lately]
         return bool(stamps) and all(stamp >= near for stamp in stamps)
+
+
+class Neighbours:
+    """The newest report of each peer and stage."""
+
+    def __init__(self, settings: RoundSettings) -> None:
+        self._stages: dict[RoundStage, Reports[RoundReport]] = {stage: Reports(settings) for stage in RoundStage}
+
+    def hear(self, told: Told[RoundReport]) -> bool:
+        """Keep a report; False if a newer one is known."""
+        return self._stages[told.report.stage].hear(told)
+
+    def link_changed(self, event: LinkChange) -> bool:
+        """Forget what a former life of a peer has told; whether there was one."""
+        changed = [reports.link_changed(event) for reports in self._stages.values()]
+        return any(changed)
+
+    def newest(self, stage: RoundStage, t_ns: int) -> list[Told[RoundReport]]:
+        """What is not too old at `t_ns`, in ascending order of peers."""
+        return self._stages[stage].newest(t_ns)
+
+    def all_told(self, stage: RoundStage, t_ns: int) -> bool:
+        """Whether everybody who told lately has told of the round at `t_ns`; nobody else is waited for."""
+        return self._stages[stage].all_told(t_ns)
 
 
 class RoundClock:

@@ -29,7 +29,7 @@ def nanoseconds(seconds: float) -> int:
 @dataclass(frozen=True, slots=True)
 class LocalizationSettings:
     """Cooperative localization: `clat`, by contacts of pairs; `replica`, by raw data told to the whole team;
-    `jlatt`, by rounds in which neighbours tell their beliefs.
+    `jlatt`, by rounds in which neighbours tell their beliefs; `fixed`, not at all: the pose is what fixes say.
 
     weights                           how `jlatt` weighs what may be correlated
     sighting_weight / fusion_weight   how intersections choose their weight
@@ -39,7 +39,7 @@ class LocalizationSettings:
     max_lines                         identity lines kept per peer
     """
 
-    kind: Literal["clat", "replica", "jlatt"] = "clat"
+    kind: Literal["clat", "replica", "jlatt", "fixed"] = "clat"
     form: Literal["auto", "split_joint", "safe", "published", "joint"] = "auto"
     transform: Transform = "unscented"
     correlation: Literal["factors", "ignored"] = "factors"
@@ -197,6 +197,20 @@ class CoastSettings:
     yaw_rate_radps: float = 0.5
 
 
+@dataclass(frozen=True, slots=True)
+class TrackingSettings:
+    """How targets are tracked: `own`, by the robot's own filter; else by bearings that robots tell each other once per
+    round (`agent.triangulator`).
+
+    memory_s      time in which what is known fades to 1 / e, of the kind `stt`; None: as published
+    parallax_rad  a place is told once bearings cross by so much, and more than noise may make them seem to; 0: at once
+    """
+
+    kind: Literal["own", "stt", "cmkf", "cikf", "hcmci", "tkf", "kcf_plus", "icf_plus"] = "own"
+    memory_s: float | None = None
+    parallax_rad: float = 0.1
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetSettings:
     """A target all robots know of: its model, and the common prior at the start, mean (n,) and cov (n, n).
@@ -260,6 +274,7 @@ class AgentSettings:
     planning: PlanningSettings = PlanningSettings()
     unsafe: UnsafeSettings = UnsafeSettings()
     track: bool = True
+    tracking: TrackingSettings = TrackingSettings()
     team: tuple[TeamMember, ...] = ()
     track_end: TrackEnd = TrackEnd()
     track_within_m: float | None = None

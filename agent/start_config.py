@@ -61,9 +61,10 @@ def check_start(
             f"source = '{source}' does not go with {rigid}, which takes all robots to start together; "
             "take form = 'split_joint'"
         )
-    if source == "peer" and localization.kind == "jlatt":
+    if source == "peer" and localization.kind in ("jlatt", "fixed"):
         raise ConfigError(
-            "source = 'peer' does not go with kind = 'jlatt', where nobody asks a single peer; take 'fix' or 'survey'"
+            f"source = 'peer' does not go with kind = '{localization.kind}', where nobody asks a single peer; "
+            "take 'fix' or 'survey'"
         )
     missing = []
     if source == "fix" and not ({"position", "pose"} & {*kinds} or "position" in fixes):

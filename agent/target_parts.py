@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
 from agent.config_file import ConfigError, Finite, Id, Part, Positive
 from agent.config_parts import LocalizationPart, SigmaPart, held_altitude
 from agent.estimation.motion import LAYOUTS, SPATIAL, TargetMotion
 from agent.motion_parts import ControlNoisePart, ControlPart
-from agent.settings import TargetSettings, TrackEnd, nanoseconds
+from agent.settings import TargetSettings, TrackEnd, TrackingSettings, nanoseconds
 
 TargetModel = Literal[
     "unicycle",
@@ -25,13 +26,18 @@ TargetModel = Literal[
 
 
 class TrackingPart(Part):
-    """How tracks of targets start and end.
+    """How targets are tracked, and how their tracks start and end.
+
+    `clat`: by the filter that localizes the robot. The others triangulate: robots tell each other bearings once per
+    round (`agent.triangulator`); `memory_s` and `parallax_rad` are of those.
 
     A bearing or a range alone starts one only with `start_within_m`, how far off a target can be then. A track ends
     when nothing was learnt of its target for `end_after_s`, or it is less sure than `end_above_m`; absent: never.
     """
 
-    kind: Literal["clat", "none"] = "clat"
+    kind: Literal["clat", "stt", "cmkf", "cikf", "hcmci", "tkf", "kcf_plus", "icf_plus", "none"] = "clat"
+    memory_s: Positive | None = None
+    parallax_rad: Annotated[float, Field(ge=0.0, lt=1.5)] = 0.1
     start_within_m: Positive | None = None
     end_after_s: Positive | None = None
     end_above_m: Positive | None = None
@@ -39,10 +45,33 @@ class TrackingPart(Part):
     def end(self) -> TrackEnd:
         return TrackEnd(None if self.end_after_s is None else nanoseconds(self.end_after_s), self.end_above_m)
 
+    def settings(self) -> TrackingSettings:
+        if self.kind == "clat" or self.kind == "none":
+            return TrackingSettings()
+        return TrackingSettings(self.kind, self.memory_s, self.parallax_rad)
+
+    def check_targets(self, models: Sequence[tuple[str, str]]) -> None:
+        """Raises `ConfigError` if targets (id, model) can't be triangulated, or a key is of another kind."""
+        if self.memory_s is not None and self.kind != "stt":
+            raise ConfigError(f"tracking.memory_s is of kind 'stt', and tracking.kind = '{self.kind}'; remove it")
+        if self.kind in ("clat", "none"):
+            return
+        flat = next((name for name, model in models if model != "constant_velocity_3d"), None)
+        if flat is not None:
+            raise ConfigError(
+                f"targets.{flat}.model: tracking.kind = '{self.kind}' needs 'constant_velocity_3d': it triangulates a "
+                "place and a velocity in space"
+            )
+        if self.start_within_m is not None:
+            raise ConfigError(
+                f"tracking.start_within_m does not go with tracking.kind = '{self.kind}', whose tracks begin where "
+                "bearings cross; remove it"
+            )
+
     def check_kind(self, localization: LocalizationPart, without_prior: Sequence[str]) -> None:
         """Raises `ConfigError` if tracks are to start or end, and the filter has the same ones all the time."""
         rigid = localization.rigid()
-        if rigid is None or self.kind == "none":
+        if rigid is None or self.kind != "clat":
             return
         if without_prior:
             raise ConfigError(

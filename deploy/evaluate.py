@@ -20,7 +20,7 @@ from deploy.launch import Outcome
 from network.links import FATE_COLUMNS
 from network.messages import PairReply, ReplyStatus
 from sim.agents import autopilot_fix
-from sim.bound import BoundRunner
+from sim.bearing_bound import bound_of
 from sim.engine import TrialResult, network_figures
 from sim.fault_plan import trial_faults
 from sim.faulty_world import FaultyWorld
@@ -54,7 +54,7 @@ def collect(
     for row in _fates(scenario, run_dir):
         gone = row["in_range"] == "0" or row["lost"] == "1"
         traffic["lost" if gone else "delivered"] += 1
-    runner = BoundRunner(scenario, world) if with_bound else None
+    runner = bound_of(scenario, world) if with_bound else None
     measured = MeasurementLog()
     for k in range(world.steps + 1):
         outputs = sensed.outputs(k) if k else []

@@ -9,7 +9,7 @@ from agent.fault_parts import ClockDriftPart, ClockStepPart
 from agent.settings import nanoseconds
 from network.messages import PairReply, PairRequest, SplitReply, SplitRequest, StartRequest
 from sim.fault_plan import trial_faults
-from sim.sampling import Sampler, sample_stride
+from sim.sampling import Sampler
 from sim.scenario import Scenario
 from sim.world import World
 
@@ -69,7 +69,7 @@ class InstantEstimates:
 
     def __init__(self, sampler: Sampler, world: World, robot: str) -> None:
         self._sampler, self._robot = sampler, robot
-        self._stride_ns = sample_stride(world.step_ns) * world.step_ns
+        self._stride_ns = sampler.stride_ns
         self._ahead_ns, self._behind_ns = AHEAD_STEPS * world.step_ns, MAX_BEHIND_STEPS * world.step_ns
         self._span_ns = world.steps * world.step_ns
         self._row, self._measured_ns = 0, 0

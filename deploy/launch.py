@@ -76,8 +76,9 @@ class Launcher:
     ) -> None:
         """`hosts`: network namespaces the agents run in (absent: all on loopback); needs root. Raises `ConfigError`."""
         self._hosts = hosts or {}
-        if self._hosts and scenario.links.range_m is not None:
-            raise ConfigError("links.range_m: who hears whom cannot be told to agents in namespaces; leave it out")
+        for key in ("range_m", "nearest", "rewire"):
+            if self._hosts and getattr(scenario.links, key) is not None:
+                raise ConfigError(f"links.{key}: who hears whom cannot be told to agents in namespaces; leave it out")
         self._scenario, self._world, self._seed, self._speed = scenario, world, seed, speed
         self._run_dir = run_dir
         self.members: dict[str, Member] = {}

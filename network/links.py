@@ -36,6 +36,8 @@ class LinkSettings:
 
     range_m       reach; None: everybody hears everybody
     hysteresis_m  an existing link breaks only beyond range_m + hysteresis_m
+    nearest       a robot hears so many of those in range, the nearest; None: all
+    rewire        a robot hears so many of those in range, drawn anew at every instant; None: all
     loss          probability that a packet is lost
     delay_s       shortest delay; an exponential tail of mean `delay_tail_s` comes on top
     duplicate     probability that a packet arrives twice
@@ -44,6 +46,8 @@ class LinkSettings:
     seed: int
     range_m: float | None = None
     hysteresis_m: float = 0.0
+    nearest: int | None = None
+    rewire: int | None = None
     loss: float = 0.0
     delay_s: float = 0.0
     delay_tail_s: float = 0.0
@@ -60,6 +64,15 @@ class LinkSettings:
         for name in ("loss", "duplicate"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must lie within 0 and 1")
+        for name in ("nearest", "rewire"):
+            count = getattr(self, name)
+            if count is not None and count < 1:
+                raise ValueError(f"{name} must be at least 1, or None")
+
+    @property
+    def limited(self) -> bool:
+        """Whether somebody may be out of hearing, so that the world has to tell who hears whom."""
+        return self.range_m is not None or self.nearest is not None or self.rewire is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +143,7 @@ LinkState = Callable[[str, str, int], bool]
 
 
 class LinkModel:
-    """Decides for every packet. `link_state` is asked only when `settings.range_m` is set.
+    """Decides for every packet. `link_state` is asked only when the settings are `limited`.
 
     `faults` come on top of what is true of all links at all times.
     """
@@ -146,6 +159,7 @@ class LinkModel:
         self.faults = faults if faults is not None else LinkFaults(settings.seed)
         self.counters: Counter[str] = Counter()
         self._link_state = link_state
+        self._limited = settings.limited
         self._log = log
         chance = settings.loss > 0.0 or settings.duplicate > 0.0 or settings.delay_tail_s > 0.0
         self._only_fate = None if chance else Fate(False, _delay_ns(settings, 0.0), None)
@@ -180,9 +194,7 @@ class LinkModel:
             incarnation=parcel.incarnation,
             seq=parcel.seq,
         )
-        in_range = self.settings.range_m is None or self._link_state(
-            parcel.source, parcel.destination, parcel.t_send_ns
-        )
+        in_range = not self._limited or self._link_state(parcel.source, parcel.destination, parcel.t_send_ns)
         arrives = in_range and not fate.lost
         effect = self.faults.on(parcel) if arrives and self.faults.faults else UNHARMED
         delays_ns: tuple[int, ...] = ()
@@ -227,6 +239,17 @@ def hear(
     if range_m is None:
         return np.ones(np.broadcast(before, distance).shape, dtype=bool)
     return np.asarray(distance <= np.where(before, range_m + hysteresis_m, range_m))
+
+
+def lowest(rank: ArrayLike, count: int) -> NDArray[np.bool_]:
+    """Who hears whom (n, n), by (source, destination): each destination its `count` sources of lowest `rank` (n, n).
+
+    Nobody hears himself, nor a source of infinite rank. Of equal ones the first is heard.
+    """
+    values = np.array(rank, dtype=float)
+    np.fill_diagonal(values, np.inf)
+    place = np.argsort(np.argsort(values, axis=0, kind="stable"), axis=0, kind="stable")
+    return np.asarray((place < count) & np.isfinite(values))
 
 
 class RangeTable:

@@ -21,6 +21,7 @@ from network.messages import (
     MAX_MEASUREMENTS,
     MAX_MESSAGE_BYTES,
     SCHEMA,
+    BearingReport,
     Body,
     ClockEcho,
     Epoch,
@@ -39,6 +40,7 @@ from network.messages import (
     StartRequest,
     TeamReport,
 )
+from network.wire_bearings import pack_bearings, read_bearings
 from network.wire_fields import (
     WireError,
     pack_epoch,
@@ -64,6 +66,7 @@ from network.wire_team import pack_report, read_report
 
 _HELLO, _PAIR_REQUEST, _PAIR_REPLY, _SPLIT_REQUEST, _SPLIT_REPLY, _TEAM_REPORT = 1, 2, 3, 4, 5, 6
 _JOINT_REQUEST, _JOINT_REPLY, _START_REQUEST, _LIFE_NOTICE, _ROUND_REPORT = 7, 8, 9, 10, 11
+_BEARING_REPORT = 12
 _HEADER_BYTES = 3 + 25 + 5 * 9 + 1
 """Upper bound of what surrounds a body: array marks, schema, longest source, five integers, kind."""
 
@@ -146,6 +149,8 @@ def _pack_body(body: Body) -> tuple[int, tuple[Any, ...]]:
         return _TEAM_REPORT, pack_report(body)
     if isinstance(body, RoundReport):
         return _ROUND_REPORT, pack_round(body)
+    if isinstance(body, BearingReport):
+        return _BEARING_REPORT, pack_bearings(body)
     if isinstance(body, StartRequest):
         return _START_REQUEST, (pack_epoch(body.epoch),)
     if isinstance(body, LifeNotice):
@@ -306,4 +311,5 @@ _BODIES: dict[int, Callable[[Any, Header], Body]] = {
     _START_REQUEST: _start_request,
     _LIFE_NOTICE: _life_notice,
     _ROUND_REPORT: read_round,
+    _BEARING_REPORT: read_bearings,
 }

@@ -67,7 +67,7 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
                 "form": sensor.form,
                 **({"intrinsics": table(sensor.intrinsics)} if sensor_kind(name, sensor) == "pixel" else {}),
             }
-            for name, sensor in robot.sensors.items()
+            for name, sensor in world.sensors(robot.id).items()
         },
         "targets": targets,
         "landmarks": [{"id": name, "position": [float(x) for x in place]} for name, place in world.landmarks.items()],

@@ -36,7 +36,7 @@ class BoundRunner:
         self._sensors = {
             (robot.id, name): sensor_config(sensor)
             for robot in scenario.robots
-            for name, sensor in robot.sensors.items()
+            for name, sensor in world.sensors(robot.id).items()
         }
         self._lag_ns = max((sensor.lag_ns for sensor in self._sensors.values()), default=0)
         self._waiting: list[Output] = []

@@ -24,7 +24,7 @@ from network.links import FateRecord, LinkModel, RangeTable
 from network.messages import Epoch, Packet
 from network.wire import peek_header
 from sim.agents import agent_config, autopilot_fix
-from sim.bound import BoundRunner
+from sim.bearing_bound import bound_of
 from sim.engine_faults import ClockChange, EngineFaults, Forged, Happening, Intruder, Pause, Resume, Start, Stop
 from sim.fault_plan import trial_faults
 from sim.faulty_world import FaultyWorld
@@ -114,11 +114,11 @@ class VirtualEngine:
             for robot in scenario.robots
         }
         self._range = RangeTable()
-        links = scenario.links
-        self._reach = None if links.range_m is None else Reach(world, links.range_m, links.hysteresis_m)
-        self._links = LinkModel(links.settings(seed), self._range.state, fate_sink, self._faults.links)
+        links = scenario.links.settings(seed)
+        self._reach = Reach(world, links) if links.limited else None
+        self._links = LinkModel(links, self._range.state, fate_sink, self._faults.links)
         self._sampler = Sampler(scenario, world, with_bound)
-        self._bound = BoundRunner(scenario, world) if with_bound else None
+        self._bound = bound_of(scenario, world) if with_bound else None
         self.contacts: list[tuple[float, str, str]] = []
         self._measured = MeasurementLog()
         self._applied: dict[str, int] = {}

@@ -13,6 +13,7 @@ from agent.fault_parts import AnySensorFaultPart, BiasPart, DropoutPart, Outlier
 from agent.settings import nanoseconds
 from network.faults import exponential_ns
 from sim.noise import generator
+from sim.scenario import SensorPart
 from sim.world import Output, World
 
 Array = NDArray[np.float64]
@@ -55,6 +56,9 @@ class FaultyWorld:
 
     def start_belief(self, entity: str) -> tuple[Array, Array]:
         return self._world.start_belief(entity)
+
+    def sensors(self, robot: str) -> dict[str, SensorPart]:
+        return self._world.sensors(robot)
 
     def truth(self, entity: str, k: int) -> Array:
         return self._world.truth(entity, k)

@@ -107,8 +107,8 @@ class WorldHost:
             self._motion = MotionWriter(Path(plan.motion), world.motion)
             self._motion.add(0)
         self._clocks: dict[str, FaultyClock] = {robot.id: FaultyClock() for robot in self._scenario.robots}
-        links = self._scenario.links
-        self._reach = None if links.range_m is None else Reach(self._world, links.range_m, links.hysteresis_m)
+        links = self._scenario.links.settings(plan.seed)
+        self._reach = Reach(self._world, links) if links.limited else None
         self._feed = LinkFeed()
         self._parts: dict[str, RobotPart] = {robot.id: robot for robot in self._scenario.robots}
         self._servers: dict[str, StandInServer] = {}

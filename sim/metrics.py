@@ -289,16 +289,22 @@ def fleet_figures(trials: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "heading_rmse_rad": _rmse(robots, "heading"),
         "anees": _anees(robots),
         "target_position_rmse_m": _rmse(tracks),
+        "target_velocity_rmse_mps": _rmse(tracks, "velocity"),
         "target_anees": _anees(tracks),
     }
 
 
 def trial_figures(reduced: dict[str, Any]) -> dict[str, Any]:
-    """One trial as a row: fleet figures and each robot's position RMSE and NEES."""
+    """One trial as a row: fleet figures, each robot's position RMSE and NEES, and what all robots make of each target.
+    """
     row = fleet_figures([reduced])
     for name, item in reduced["robots"].items():
         row[f"{name}_position_rmse_m"] = _rmse([item])
         row[f"{name}_nees"] = _anees([item])
+    for name, owners in reduced["targets"].items():
+        row[f"{name}_position_rmse_m"] = _rmse(list(owners.values()))
+        if any(item["velocity"] is not None for item in owners.values()):
+            row[f"{name}_velocity_rmse_mps"] = _rmse(list(owners.values()), "velocity")
     return row
 
 

@@ -1,4 +1,4 @@
-"""True motion that depends on nobody: constant controls with noise, and what is pushed at random."""
+"""True motion that depends on nobody: constant controls with noise, courses, and what is pushed at random."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from agent.config_file import ConfigError
 from agent.config_parts import start_size
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import LAYOUTS, SPATIAL, UNICYCLE_GAINS, StateLayout, velocity_step
+from agent.settings import nanoseconds
+from sim.course import followed
 from sim.noise import normal_rows
 from sim.scenario import RobotPart, Scenario, TargetPart
 
@@ -23,6 +25,8 @@ def driven(scenario: Scenario, mover: RobotPart | TargetPart, start: Array, seed
         raise ConfigError(f"{scenario.name}: {mover.id}.start.pose needs {size} numbers for '{mover.model}'")
     if layout.heading is None:
         assert isinstance(mover, TargetPart)
+        if mover.course is not None:
+            return followed(mover.course, layout, start, nanoseconds(scenario.step_s), steps)
         return _drifted(scenario, mover, layout, start, seed, steps)
     dt = scenario.step_s
     noise = normal_rows(seed, steps, 2, mover.id, "control")

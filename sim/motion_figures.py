@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.settings import NS
+from sim.reach import Reach
 from sim.scenario import Scenario
 from sim.sight import steps_between
 from sim.world import World
@@ -27,7 +28,7 @@ def distances(places: Array) -> Array:
 
 
 def connected(near: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which of the graphs (K, n, n) are connected, of symmetric edges."""
+    """In which of the graphs (K, n, n) there is a way from everybody to everybody."""
     n = near.shape[1]
     reached = (near | np.eye(n, dtype=bool)).astype(np.float64)
     for _ in range(max(1, n - 1).bit_length()):
@@ -42,13 +43,19 @@ def entries(below: NDArray[np.bool_]) -> int:
 
 
 def motion_figures(
-    places: Array, inside: NDArray[np.bool_], step_s: float, collision_m: float, range_m: float | None
+    places: Array,
+    inside: NDArray[np.bool_],
+    step_s: float,
+    collision_m: float,
+    range_m: float | None,
+    heard: NDArray[np.bool_] | None = None,
 ) -> dict[str, float | None]:
     """Figures of places (K, n, 3) of n robots at instants `step_s` apart; None of what there is nothing of.
 
     collisions       how often a pair came below `collision_m`, over all instants
     min_distance_m   the smallest of any pair at any instant
-    connected_share  share of the instants `inside` (K,) at which the graph of pairs within `range_m` is connected
+    connected_share  share of the instants `inside` (K,) at which the graph of pairs within `range_m` is connected, or
+                     that of `heard` (K, n, n), by (source, destination), leads from everybody to everybody
     speed_mps        mean of all robots between the instants `inside`
     """
     count, n = places.shape[:2]
@@ -60,7 +67,9 @@ def motion_figures(
         gaps = distances(places[part])
         below[part] = gaps < collision_m
         least = min(least, float(gaps.min(initial=np.inf)))
-        if range_m is not None:
+        if heard is not None:
+            whole[part] = connected(heard[part])
+        elif range_m is not None:
             whole[part] = connected(gaps <= range_m)
     moved = np.linalg.norm(np.diff(places[inside], axis=0), axis=-1)
     return {
@@ -97,7 +106,11 @@ def trial_motion(scenario: Scenario, world: World, measured: Instants, played: i
     places = np.array([[world.place(robot, k) for robot in world.robots] for k in range(played + 1)])
     t_s = np.arange(played + 1) * world.step_ns / NS
     inside = (t_s >= scenario.window_s[0] - 1e-9) & (t_s <= scenario.window_s[1] + 1e-9)
-    figures = motion_figures(places, inside, world.step_ns / NS, scenario.collision_m, scenario.links.range_m)
+    links, heard = scenario.links.settings(world.seed), None
+    if links.nearest is not None or links.rewire is not None:
+        reach = Reach(world, links)
+        heard = np.array([reach.heard(k) for k in range(played + 1)])
+    figures = motion_figures(places, inside, world.step_ns / NS, scenario.collision_m, links.range_m, heard)
     return figures | {"target_seen_share": seen_share(scenario, measured, inside)}
 
 

@@ -17,6 +17,11 @@ def generator(seed: int, *names: str) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(key=key))
 
 
+def uniform_rows(seed: int, count: int, size: int, *names: str) -> Array:
+    """Numbers (count, size) drawn evenly from [0, 1); row k is the same for every `count` > k."""
+    return generator(seed, *names).random((count, size))
+
+
 def normal_rows(seed: int, count: int, size: int, *names: str) -> Array:
     """Standard normal numbers (count, size); row k is the same for every `count` > k."""
     return generator(seed, *names).standard_normal((count, size))

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.motion import LAYOUTS
-from agent.settings import NS
+from agent.settings import NS, nanoseconds
 from sim.metrics import StateTrace, TrialTrace
 from sim.scenario import Scenario
 from sim.world import Output, World
@@ -32,9 +32,9 @@ class MeasurementLog:
         return {key: np.unique(times) / NS for key, times in sorted(self._found.items())}
 
 
-def sample_stride(step_ns: int) -> int:
-    """Steps between two samples of the figures: every step, but at most once per second."""
-    return max(1, -(-NS // step_ns))
+def sample_stride(step_ns: int, sample_ns: int = NS) -> int:
+    """Steps between two samples of the figures: every step, but at most once per `sample_ns`."""
+    return max(1, -(-sample_ns // step_ns))
 
 
 class Sampler:
@@ -42,7 +42,7 @@ class Sampler:
 
     def __init__(self, scenario: Scenario, world: World, with_bound: bool) -> None:
         self._world = world
-        self._stride = sample_stride(world.step_ns)
+        self._stride = sample_stride(world.step_ns, nanoseconds(scenario.sample_s))
         self._instants = list(range(0, world.steps + 1, self._stride))
         self._layouts = {name: LAYOUTS[part.model] for name, part in scenario.movers().items()}
         self._owned: dict[tuple[str, str], tuple[Array, Array]] = {}
@@ -54,6 +54,11 @@ class Sampler:
     def _blank(self, entity: str) -> tuple[Array, Array]:
         n, count = self._layouts[entity].dim, len(self._instants)
         return np.full((count, n), np.nan), np.full((count, n, n), np.nan)
+
+    @property
+    def stride_ns(self) -> int:
+        """Time between two samples."""
+        return self._stride * self._world.step_ns
 
     def row(self, k: int) -> int | None:
         """Index of instant k among the samples, None if it is not sampled."""

@@ -15,6 +15,7 @@ from agent.config_file import (
     P,
     Part,
     Positive,
+    Share,
     Vector2,
     Vector3,
     validate,
@@ -46,8 +47,13 @@ from agent.settings import nanoseconds
 from agent.start_config import StartSource
 from agent.target_parts import TargetModel, TrackingPart, target_motion
 from agent.unsafe_parts import UnsafePart
+from sim.course import CoursePart
+from sim.directions import DirectionNoise
 
 Subject = Literal["peers", "landmarks", "targets"]
+
+SPATIAL_FORMATS = ("drone_cameras",)
+"""Recordings in space; those of other formats are planar."""
 
 MIN_STEP_S = 0.001
 """The shortest step of a world."""
@@ -82,7 +88,7 @@ class SteeringPart(Part):
 
 class WorldPart(Part):
     kind: Literal["simulated", "recording"] = "simulated"
-    format: Literal["utias", "tiers"] = "utias"
+    format: Literal["utias", "tiers", "drone_cameras"] = "utias"
     path: str | None = None
     robots: list[Id] | None = None
     placement: PlacementPart | None = None
@@ -111,9 +117,12 @@ class SensorPart(Part):
     """A sensor: what it measures (`kind`, by default its name), of whom, how well, how far and how often.
 
     sigma_m grows by sigma_m_per_m with the distance; sigma_z_m is that of an altitude, sigma_m by default. `rate_hz`
-    absent: once per step. Nothing is seen beyond `max_range_m`, nearer than `min_range_m` or out of the field of view
-    `fov_rad`, which is centred on the sensor's forward axis. Simulated ranges are too long by `bias_m`, or by what
-    `bias_of` says of the subject.
+    absent: once per step; of recorded sightings all, and at most so many otherwise. Nothing is seen beyond
+    `max_range_m`, nearer than `min_range_m` or out of the field of view `fov_rad`, which is centred on the sensor's
+    forward axis. Simulated ranges are too long by `bias_m`, or by what `bias_of` says of the subject. Directions
+    (`bearing3`) err by `noise`, see `sim.directions`. Who could be seen is detected with the probability `detects`; the
+    share `false_share` of detections is of a direction drawn evenly. A recorded camera has the mount and intrinsics of
+    the recording.
     """
 
     kind: SensorKind | None = None
@@ -123,6 +132,9 @@ class SensorPart(Part):
     sigma_z_m: Positive | None = None
     sigma_rad: Positive | None = None
     sigma_px: Positive | None = None
+    noise: DirectionNoise = "angles"
+    detects: Share = 1.0
+    false_share: Share = 0.0
     bias_m: Finite = 0.0
     bias_of: dict[str, Finite] = {}
     max_range_m: Positive | None = None
@@ -202,7 +214,7 @@ class TargetPart(Part):
     """A target. Without a `prior` no robot knows of its place before it is seen.
 
     With `assumed_noise` its control is unknown to the robots, but for an altitude: they take it to be none, with this
-    noise.
+    noise. One with a `course` follows it exactly, and its noise is only what robots assume of it.
     """
 
     id: Id
@@ -211,6 +223,7 @@ class TargetPart(Part):
     prior: bool = True
     start: StartPart = StartPart()
     start_sigma: SigmaPart
+    course: CoursePart | None = None
     control: ControlPart = ControlPart()
     noise: ControlNoisePart = ControlNoisePart()
     assumed_noise: ControlNoisePart | None = None
@@ -258,6 +271,7 @@ class Scenario(Part):
     name: Id
     duration_s: Positive
     step_s: Positive
+    sample_s: Positive = 1.0
     window_s: Vector2
     lost_above_m: Positive = 8.0
     collision_m: Positive = 2.0

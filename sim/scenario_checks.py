@@ -12,7 +12,17 @@ from agent.fault_parts import AnyFaultPart, SensorDelayPart, SensorFaultPart, ch
 from agent.joint_room import check_room
 from agent.motion_parts import ControlPart
 from agent.start_config import check_start
-from sim.scenario import KINDS, MIN_STEP_S, RobotPart, Scenario, SensorPart, TargetPart, sensor_kind, target_sensor
+from sim.scenario import (
+    KINDS,
+    MIN_STEP_S,
+    SPATIAL_FORMATS,
+    RobotPart,
+    Scenario,
+    SensorPart,
+    TargetPart,
+    sensor_kind,
+    target_sensor,
+)
 from sim.vehicle_telemetry import VEHICLES, StandInSettings
 
 
@@ -41,6 +51,7 @@ def check(scenario: Scenario) -> None:
             f"{scenario.duration_s:g} s; shorten it with --set 'window_s=[0, {scenario.duration_s:g}]'"
         )
     recorded = scenario.world.kind == "recording"
+    spatial = recorded and scenario.world.format in SPATIAL_FORMATS
     if recorded and scenario.world.path is None:
         raise ConfigError(f"{scenario.name}: world.path is missing; add --set world.path=FOLDER of the recording")
     placement = scenario.world.placement
@@ -50,6 +61,10 @@ def check(scenario: Scenario) -> None:
             f"{scenario.name}: world.placement.reaches = '{placement.reaches}' is no robot on a circle; "
             f"there are: {', '.join(circling)}"
         )
+    try:
+        scenario.links.settings(0)
+    except ConfigError as error:
+        raise ConfigError(f"{scenario.name}: {error}") from None
     _check_steering(scenario)
     _check_planning(scenario)
     _check_team(scenario)
@@ -57,10 +72,11 @@ def check(scenario: Scenario) -> None:
     for robot in scenario.robots:
         _check_mover(f"{scenario.name}: robots.{robot.id}", robot)
         _check_autopilot(f"{scenario.name}: robots.{robot.id}", robot)
-        if recorded and LAYOUTS[robot.model].altitude is not None:
+        if recorded and (LAYOUTS[robot.model].altitude is not None) != spatial:
+            has, kind, other = ("no", "in space", "planar_altitude") if spatial else ("an", "planar", "unicycle")
             raise ConfigError(
-                f"{scenario.name}: robots.{robot.id}.model = '{robot.model}' has an altitude, and recordings are "
-                "planar; take 'unicycle'"
+                f"{scenario.name}: robots.{robot.id}.model = '{robot.model}' has {has} altitude, and recordings of "
+                f"format '{scenario.world.format}' are {kind}; take '{other}'"
             )
         scenario.lateness_of(robot)
         try:
@@ -71,6 +87,7 @@ def check(scenario: Scenario) -> None:
         try:
             localization.settings()
             tracking.check_kind(localization, [target.id for target in scenario.targets if not target.prior])
+            tracking.check_targets([(target.id, target.model) for target in scenario.targets])
             if localization.form == "joint":
                 followed = scenario.targets if tracking.kind != "none" else []
                 check_room(LAYOUTS[robot.model], [(target.id, LAYOUTS[target.model]) for target in followed])
@@ -88,6 +105,8 @@ def check(scenario: Scenario) -> None:
         for name, sensor in robot.sensors.items():
             where = f"{scenario.name}: robots.{robot.id}.sensors.{name}"
             check_sensor(where, name, sensor)
+            if recorded:
+                _check_recorded(where, sensor)
     for target in scenario.targets:
         _check_mover(f"{scenario.name}: targets.{target.id}", target)
         if target.recorded != recorded:
@@ -95,13 +114,16 @@ def check(scenario: Scenario) -> None:
                 f"{scenario.name}: targets.{target.id}.recorded = {str(recorded).lower()} is needed in a "
                 f"{scenario.world.kind} world"
             )
-        if recorded and (LAYOUTS[target.model].heading is not None or LAYOUTS[target.model].dim != 4):
+        layout, axes = LAYOUTS[target.model], 3 if spatial else 2
+        if recorded and (layout.heading is not None or len(layout.position) != axes or layout.dim != 2 * axes):
+            suffix = "_3d" if spatial else ""
             raise ConfigError(
                 f"{scenario.name}: targets.{target.id}.model = '{target.model}' needs what nobody knows of a "
-                "recorded target; take 'damped_velocity' or 'constant_velocity'"
+                f"recorded target; take 'damped_velocity{suffix}' or 'constant_velocity{suffix}'"
             )
         if not recorded and target.start.pose is None:
             raise ConfigError(f"{scenario.name}: targets.{target.id}.start.pose is missing")
+        _check_course(f"{scenario.name}: targets.{target.id}", target)
 
 
 def _check_autopilot(where: str, robot: RobotPart) -> None:
@@ -141,6 +163,12 @@ def _check_team(scenario: Scenario) -> None:
                 f"{scenario.name}: robots.{other}.localization.kind = '{kinds[other]}' beside '{kind}': {why}; "
                 "give all robots one kind"
             )
+    tracked = {scenario.tracking_of(robot).kind for robot in scenario.robots} - {"none"}
+    if len(tracked) > 1:
+        raise ConfigError(
+            f"{scenario.name}: tracking.kind is {' and '.join(map(repr, sorted(tracked)))}: robots do not understand "
+            "what another kind tells; give all robots one kind, or 'none'"
+        )
     if "replica" in kinds.values() and len(kinds) > MAX_TEAM + 1:
         raise ConfigError(
             f"{scenario.name}: localization.kind = 'replica' takes {MAX_TEAM + 1} robots at most, there are "
@@ -212,6 +240,25 @@ def _check_steering(scenario: Scenario) -> None:
             raise ConfigError(f"{where}: robots.{robot.id}.control is not used with it; leave it out")
 
 
+def _check_course(where: str, target: TargetPart) -> None:
+    """A course is of a target that moves by its velocity, in a simulated world."""
+    if target.course is None:
+        return
+    try:
+        target.course.check(target.model)
+    except ConfigError as error:
+        raise ConfigError(f"{where}.{error}") from None
+    if target.recorded:
+        raise ConfigError(f"{where}.course does not go with a recording, where it went its way already; leave it out")
+
+
+def _check_recorded(where: str, sensor: SensorPart) -> None:
+    """What a recorded sensor said is not made worse."""
+    for key in ("noise", "detects", "false_share"):
+        if getattr(sensor, key) != getattr(SensorPart(), key):
+            raise ConfigError(f"{where}.{key} does not go with a recording, which is as it is; leave it out")
+
+
 def _check_mover(where: str, part: RobotPart | TargetPart) -> None:
     """Deviations of the start, altitude noise and size of the pose are those the model needs."""
     try:
@@ -248,3 +295,10 @@ def check_sensor(where: str, name: str, sensor: SensorPart) -> None:
         raise ConfigError(f"{where}: sigma_px is missing")
     if kind in RELATIVE_ANGLES and not sensor.of:
         raise ConfigError(f'{where}: of is missing, for instance of = ["peers"]')
+    for key, kinds in (
+        ("noise", ("bearing3",)),
+        ("detects", tuple(RELATIVE_ANGLES)),
+        ("false_share", ("bearing", "bearing3")),
+    ):
+        if getattr(sensor, key) != getattr(SensorPart(), key) and kind not in kinds:
+            raise ConfigError(f"{where}.{key} is of kind {' and '.join(kinds)}, not of '{kind}'; leave it out")

@@ -107,6 +107,10 @@ def faults(scenario: Scenario, seed: int | None = None) -> list[str]:
         named.append(f"delay {links.delay_s:g} s + tail {links.delay_tail_s:g} s")
     if links.duplicate:
         named.append(f"duplicate {links.duplicate:g}")
+    if links.nearest is not None:
+        named.append(f"only the nearest {links.nearest} are heard")
+    if links.rewire is not None:
+        named.append(f"{links.rewire} are heard, others at every step")
     found = stated(scenario.faults) if seed is None else trial_faults(scenario, seed)
     if scenario.fault_plan is not None and seed is None:
         named.append(f"a plan of intensity {scenario.fault_plan.intensity}, drawn for each trial")

@@ -18,8 +18,9 @@ from agent.estimation.odometry import OdometryNoise
 from agent.settings import NS, nanoseconds
 from agent.timeline import Phase
 from sim.closed_loop import ClosedLoop, Motion, increment, planar_of
+from sim.directions import DRAWS, anywhere, direction_covariance, disturbed
 from sim.motion import driven
-from sim.noise import generator, normal_rows
+from sim.noise import generator, normal_rows, uniform_rows
 from sim.scenario import RobotPart, Scenario, SensorPart, TargetPart, sensor_kind
 from sim.sight import places, sights, steps_between
 from sim.steering import steered
@@ -73,6 +74,10 @@ class World(Protocol):
 
     def place(self, entity: str, k: int) -> Array:
         """True x, y, z (3,) at instant k; what is planar lies at z = 0."""
+        ...
+
+    def sensors(self, robot: str) -> dict[str, SensorPart]:
+        """The sensors of a robot as they are: a recorded camera has its own mount and intrinsics."""
         ...
 
     def outputs(self, k: int) -> list[Output]:
@@ -179,6 +184,7 @@ class SimulatedWorld:
             if robot.tilt_rad > 0.0
         }
         self._sensor_noise: dict[tuple[str, str, str], Array] = {}
+        self._chances: dict[tuple[str, str, str], Array] = {}
 
     def truth(self, entity: str, k: int) -> Array:
         return np.asarray(self._tracks[entity][k])
@@ -189,6 +195,9 @@ class SimulatedWorld:
     def start_belief(self, entity: str) -> tuple[Array, Array]:
         part = self._scenario.movers()[entity]
         return start_belief(part, self._tracks[entity][0], self.seed)
+
+    def sensors(self, robot: str) -> dict[str, SensorPart]:
+        return next(part.sensors for part in self._scenario.robots if part.id == robot)
 
     def steer(self, robot: str, t_ns: int, steer: Steer) -> None:
         if self._loop is None:
@@ -239,6 +248,15 @@ class SimulatedWorld:
             self._sensor_noise[key] = normal_rows(self.seed, self.steps + 1, size, *key)
         return np.asarray(self._sensor_noise[key][k])
 
+    def _chance(self, robot: str, name: str, sensor: SensorPart, of: str, k: int) -> Array | None:
+        """Uniform numbers (4,) on which it depends whether and where a subject is detected; None: where it is."""
+        if sensor.detects == 1.0 and sensor.false_share == 0.0:
+            return None
+        key = (robot, name, of)
+        if key not in self._chances:
+            self._chances[key] = uniform_rows(self.seed, self.steps + 1, 4, *key, "detected")
+        return np.asarray(self._chances[key][k])
+
     def _sense(self, robot: RobotPart, name: str, sensor: SensorPart, k: int, gaps: list[float]) -> list[Output]:
         """What a sensor measures at instant k; `gaps`: how far all places are from its robot."""
         kind, state, t_ns = sensor_kind(name, sensor), self._tracks[robot.id][k], k * self.step_ns
@@ -268,8 +286,19 @@ class SimulatedWorld:
                 continue
             if kind == "pixel" and model.intrinsics is not None and not model.intrinsics.shows(clean):
                 continue
-            R = relative_noise(kind, sensor, distance)
-            z = clean + np.sqrt(np.diagonal(R)) * self._noise(robot.id, name, of, k, len(R))
+            chance = self._chance(robot.id, name, sensor, of, k)
+            if chance is not None and chance[0] >= sensor.detects:
+                continue
+            R, turned = relative_noise(kind, sensor, distance), sensor.noise in DRAWS
+            draws = self._noise(robot.id, name, of, k, DRAWS[sensor.noise] if turned else len(R))
+            if turned:
+                z = disturbed(sensor.noise, clean, sensor.sigma_rad or 0.0, draws)
+            else:
+                z = clean + np.sqrt(np.diagonal(R)) * draws
+            if chance is not None and chance[1] < sensor.false_share:
+                z = anywhere(len(z), chance[2:], sensor.fov_rad)
+            if turned:
+                R = direction_covariance(sensor.noise, z, sensor.sigma_rad or 0.0)
             wrap_components(z, model.angles)
             if kind in ("range", "range_bearing"):
                 z[0] = max(z[0] + sensor.bias_of.get(of, sensor.bias_m), 0.0)

@@ -40,6 +40,8 @@ PURE = (
     *(str(path.relative_to(ROOT)) for path in sorted((ROOT / "agent" / "planning").glob("*.py"))),
     "sim/world.py",
     "sim/motion.py",
+    "sim/course.py",
+    "sim/directions.py",
     "sim/vehicle.py",
     "sim/motion_figures.py",
     "sim/sight.py",

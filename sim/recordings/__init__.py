@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from sim.recordings import tiers, utias
+from sim.recordings import drone_cameras, tiers, utias
 
-LOADERS = {"utias": utias.load, "tiers": tiers.load}
+LOADERS = {"utias": utias.load, "tiers": tiers.load, "drone_cameras": drone_cameras.load}

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import between
+from agent.estimation.observation import Intrinsics
+from network.messages import Mount
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -40,30 +42,43 @@ class Odometry:
 class Sightings:
     """Relative measurements: t_ns (K,), subject ids, range_m (K,) as recorded, bearing_rad (K,) left positive.
 
-    What a sensor does not measure is NaN.
+    `pixel` (K, 2) is of the robot's camera; None: it has none. What a sensor does not measure is NaN.
     """
 
     t_ns: Stamps
     subject: tuple[str, ...]
     range_m: Array
     bearing_rad: Array
+    pixel: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """Motion capture: t_ns (K,), pose (K, 3) with heading unwrapped."""
+    """Motion capture: t_ns (K,), pose x, y, heading (K, 3), in space x, y, z, heading (K, 4); heading unwrapped.
+
+    The heading of what has none is 0.
+    """
 
     t_ns: Stamps
     pose: Array
 
 
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A calibrated pinhole camera on its robot, see `agent.estimation.observation.RelativeModel`."""
+
+    mount: Mount
+    intrinsics: Intrinsics
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotRecording:
-    """What there is of one robot; None where the recording has no odometry, or no truth."""
+    """What there is of one robot; None where the recording has no odometry, no truth, or no camera."""
 
     odometry: Odometry | None
     sightings: Sightings
     truth: Truth | None
+    camera: Camera | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +101,7 @@ class Recording:
         return self.robots[name]
 
     def truth_at(self, robot: str, t_ns: int) -> Array:
-        """True pose (3,) interpolated linearly, heading wrapped.
+        """True pose (3,) or (4,) interpolated linearly, heading wrapped.
 
         Raises `RecordingError` without truth, and outside its span: a pose there would be invented.
         """
@@ -103,25 +118,27 @@ class Recording:
             before, after = int(truth.t_ns[index - 1]), int(truth.t_ns[index])
             share = (t_ns - before) / (after - before)
             pose = truth.pose[index - 1] + share * (truth.pose[index] - truth.pose[index - 1])
-        pose[2] = wrap(pose[2])
+        pose[-1] = wrap(pose[-1])
         return np.asarray(pose)
 
     def velocity_at(self, robot: str, t_ns: int) -> Array:
-        """True velocity (2,) around an instant, from truth a quarter of a second to either side where it is known."""
+        """True velocity (2,) or (3,) around an instant, from truth 0.25 s to either side where it is known."""
         truth = self._robot(robot).truth
         first, last = (t_ns, t_ns) if truth is None else (int(truth.t_ns[0]), int(truth.t_ns[-1]))
         before, after = max(t_ns - VELOCITY_SPAN_NS, first), min(t_ns + VELOCITY_SPAN_NS, last)
-        moved = self.truth_at(robot, after)[:2] - self.truth_at(robot, before)[:2]
-        return moved / ((after - before) * 1e-9) if after > before else np.zeros(2)
+        moved = self.truth_at(robot, after)[:-1] - self.truth_at(robot, before)[:-1]
+        return moved / ((after - before) * 1e-9) if after > before else np.zeros_like(moved)
 
     def increment(self, robot: str, t0_ns: int, t1_ns: int) -> Array:
         """Odometry (dx, dy, dyaw) over [t0, t1] in the body frame at t0: held commands, integrated as arcs.
 
-        Before its first command a robot stands; its last one is held on. Without odometry it is the true motion.
+        Before its first command a robot stands; its last one is held on. Without odometry it is the true motion, of
+        which a change of altitude is left out.
         """
         odometry = self._robot(robot).odometry
         if odometry is None:
-            return between(self.truth_at(robot, t0_ns), self.truth_at(robot, t1_ns))
+            first, last = (self.truth_at(robot, t_ns)[[0, 1, -1]] for t_ns in (t0_ns, t1_ns))
+            return between(first, last)
         return between(_integrated(odometry, t0_ns), _integrated(odometry, t1_ns))
 
 

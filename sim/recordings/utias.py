@@ -8,7 +8,6 @@ are the robots `r1`-`r5`, 6-20 the landmarks `L6`-`L20`. Stamps are Unix time; t
 
 from __future__ import annotations
 
-import lzma
 import re
 from collections import Counter
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.recordings.files import read_text
 from sim.recordings.recording import (
     Array,
     Odometry,
@@ -88,23 +88,13 @@ class _Table:
         return RecordingError(f"{self.path}, line {self.lines[row]}: {what}; {CUT}")
 
 
-def _text(path: Path) -> str:
-    try:
-        raw = path.read_bytes()
-        return (lzma.decompress(raw) if path.suffix == ".xz" else raw).decode()
-    except (EOFError, lzma.LZMAError):
-        raise RecordingError(f"{path}: the compressed file is cut or damaged; fetch it again") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: cannot be read ({error.__class__.__name__}); fetch it again") from None
-
-
 def _table(folder: Path, name: str, columns: int) -> _Table:
     """Raises `RecordingError` for a missing or cut file, a line of other width, and what is not a finite number."""
     path = _find(folder, name)
     if path is None:
         raise RecordingError(f"{folder}: {name}.dat is missing; {REMEDY}")
     lines, first, numbers = [], [], []
-    for number, line in enumerate(_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue

@@ -88,4 +88,4 @@ def test_ever_new_names_do_not_fill_the_memory() -> None:
         near.hear(told(f"r{k}", SECOND))
         near.link_changed(LinkChange(0, f"x{k}", True, 1, k))
     assert len(near.newest(RoundStage.PRIOR, SECOND)) == MAX_PEERS
-    assert len(near._lives) == MAX_PEERS
+    assert len(near._stages[RoundStage.PRIOR]._lives) == MAX_PEERS

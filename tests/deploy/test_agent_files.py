@@ -8,7 +8,9 @@ from typing import Any
 import pytest
 
 from agent.config import AgentConfig
-from deploy.agent_files import agent_file
+from agent.config_file import ConfigError
+from deploy.agent_files import Host, agent_file
+from deploy.launch import Launcher
 from sim.host import HostPlan
 from sim.scenario_file import load
 from sim.trial import open_world
@@ -40,3 +42,14 @@ def test_what_the_scenario_waits_for_longer_is_kept() -> None:
     tables = tables_of(10.0, "round.wait_s=0.6", "lateness.settle_s=0.5", "lateness.odometry_wait_s=4.0")
     assert (tables["round"]["wait_s"], tables["lateness"]["settle_s"]) == (0.6, 0.5)
     assert tables["lateness"]["odometry_wait_s"] == 4.0
+
+
+@pytest.mark.parametrize("links", ["{range_m=30.0}", "{nearest=2}", "{rewire=2}"])
+def test_who_is_out_of_hearing_is_learnt_from_the_world(links: str, tmp_path: Path) -> None:
+    injection = AgentConfig.model_validate(tables_of(1.0, f"links={links}")).injection
+    assert injection is not None
+    assert injection.links.settings(injection.seed).limited
+    assert injection.table == "tcp/127.0.0.1:7000"
+    scenario, key = load("ajlatt", [f"links={links}"]), links[1:].partition("=")[0]
+    with pytest.raises(ConfigError, match=f"links.{key}: who hears whom cannot be told"):
+        Launcher(scenario, open_world(scenario, 1), 1, 1.0, tmp_path, {"r1": Host("ns1", "10.0.0.1")})

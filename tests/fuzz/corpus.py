@@ -19,10 +19,19 @@ FORMS = {
     "split_joint": ["localization.form=split_joint"],
     "replica": ["localization.kind=replica"],
     "jlatt": ["localization.kind=jlatt"],
+    "icf_plus": [
+        "tracking.kind=icf_plus",
+        "robots.*.sensors.camera.kind=bearing",
+        "targets.t1.model=constant_velocity_3d",
+        "targets.t1.start.pose=[3.0, 2.0, 0.0, 0.3, 0.1, 0.0]",
+        "targets.t1.start_sigma={position_m=1.0, altitude_m=0.5, velocity_mps=0.5}",
+        "targets.t1.control={}",
+        "targets.t1.noise={acceleration_mps2=0.1}",
+    ],
 }
 """`--set` overrides by form."""
 
-KINDS = frozenset((*range(1, 10), 11))
+KINDS = frozenset((*range(1, 10), 11, 12))
 """Every kind of message of the wire format but the notice to a robot that is there twice."""
 
 

@@ -20,6 +20,7 @@ from network.links import (
     decode_table,
     encode_table,
     hear,
+    lowest,
     packet_fate,
 )
 from network.wire_fields import WireError
@@ -103,6 +104,8 @@ def test_more_loss_loses_a_superset() -> None:
         {"delay_tail_s": -1.0},
         {"range_m": math.nan},
         {"hysteresis_m": -1.0},
+        {"nearest": 0},
+        {"rewire": -1},
     ],
     ids=lambda bad: next(iter(bad)),
 )
@@ -150,6 +153,26 @@ def test_without_a_range_the_world_is_not_asked() -> None:
         raise AssertionError
 
     assert LinkModel(LinkSettings(seed=1), nobody).decide(Parcel(**PACKET, t_send_ns=0)).delays_ns == (0,)
+
+
+@pytest.mark.parametrize("part", [{"range_m": 10.0}, {"nearest": 3}, {"rewire": 3}])
+def test_if_somebody_may_be_out_of_hearing_the_world_is_asked(part: dict[str, float]) -> None:
+    made = LinkSettings(1, **part)
+    assert made.limited
+    model = LinkModel(made, lambda source, destination, t_ns: t_ns == 5)
+    assert [model.decide(Parcel(**PACKET, t_send_ns=t_ns)).delays_ns for t_ns in (4, 5)] == [(), (0,)]
+    assert model.counters["out_of_range"] == 1
+
+
+@given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**32 - 1))
+def test_each_hears_so_many_of_the_lowest_rank(n: int, count: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rank = np.where(rng.random((n, n)) < 0.3, np.inf, rng.integers(0, 4, (n, n)).astype(float))
+    heard = lowest(rank, count)
+    for destination in range(n):
+        others = [k for k in range(n) if k != destination and np.isfinite(rank[k, destination])]
+        expected = sorted(others, key=lambda k: (rank[k, destination], k))[:count]
+        assert np.flatnonzero(heard[:, destination]).tolist() == sorted(expected)
 
 
 def test_two_receivers_agree_on_a_packets_fate_without_talking() -> None:

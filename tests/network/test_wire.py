@@ -25,6 +25,8 @@ from network.messages import (
     MAX_TARGETS,
     NEVER,
     NO_MOUNT,
+    Bearing,
+    BearingReport,
     Belief,
     Body,
     ClockEcho,
@@ -39,6 +41,7 @@ from network.messages import (
     Message,
     PairReply,
     PairRequest,
+    Prediction,
     RawMeasurement,
     Reckoning,
     ReplyStatus,
@@ -157,6 +160,13 @@ def example_round() -> RoundReport:
     return RoundReport(RoundStage.PRIOR, belief, np.array([0.5, 0.0, 0.0]), -0.125, targets, (seen,))
 
 
+def example_bearings() -> BearingReport:
+    """A camera that has seen one target and expects another one somewhere."""
+    seen = Bearing("t1", np.array([1.0, -2.0, 0.5]), np.diag([0.25, 0.25, 0.0]), np.array([0.6, 0.0, 0.8]), 0.125, 90)
+    told = Prediction("t1", np.arange(6.0), 2.0 * np.eye(6)), Prediction("t2", -np.arange(6.0))
+    return BearingReport((seen,), told)
+
+
 EXAMPLES: dict[str, Body] = {
     "hello": Hello("0.1.0", (ClockEcho("r2", 10, 20), ClockEcho("r3", 30, 40))),
     "pair_request": example_request(),
@@ -170,6 +180,7 @@ EXAMPLES: dict[str, Body] = {
     "joint_reply": PairReply(Epoch(1_000, "r2", 9), ReplyStatus.OK, example_joint(met=False)),
     "start_request": StartRequest(Epoch(1000, "r1", 9)),
     "round_report": example_round(),
+    "bearing_report": example_bearings(),
     "life_notice": LifeNotice(2**53 - 1, 9, True),
 }
 

@@ -302,6 +302,10 @@ def test_figures_are_sampled_once_a_second_at_most(step_s: float, stride: int) -
     assert sample_stride(round(step_s * S)) == stride
 
 
+def test_figures_are_sampled_more_often_if_they_are_to_be() -> None:
+    assert sample_stride(S // 10, S // 5) == 2
+
+
 def test_a_robot_that_tracks_nothing_has_no_tracks() -> None:
     plain = scenario().model_dump(exclude_none=True)["robots"]
     plain[0]["tracking"] = {"kind": "none"}

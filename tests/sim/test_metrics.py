@@ -348,6 +348,22 @@ def test_a_trials_row_names_fleet_and_robots() -> None:
     assert row["r2_nees"] == summary["robots"]["r2"]["anees"]
 
 
+def test_velocities_of_targets_have_figures() -> None:
+    made = trial(1)
+    row, summary = trial_figures(reduce_trial(made, WINDOW)), summarize([made], WINDOW, LOST_M)
+    inside = (made.t_s >= WINDOW[0]) & (made.t_s <= WINDOW[1])
+    off = np.concatenate([errors(track)[inside, 2:] for track in made.targets["t1"].values()])
+    expected = math.sqrt(np.nanmean(np.sum(off**2, axis=1)))
+    assert summary["fleet"]["target_velocity_rmse_mps"] == pytest.approx(expected)
+    assert row["target_velocity_rmse_mps"] == row["t1_velocity_rmse_mps"] == pytest.approx(expected)
+    assert row["t1_position_rmse_m"] == summary["fleet"]["target_position_rmse_m"]
+    # A target with a heading has none.
+    made.targets["t1"] = {name: made.robots[name] for name in made.robots}
+    row = trial_figures(reduce_trial(made, WINDOW))
+    assert row["target_velocity_rmse_mps"] is None
+    assert "t1_velocity_rmse_mps" not in row
+
+
 def test_nothing_can_be_said_of_no_trials() -> None:
     with pytest.raises(ValueError, match="give at least one"):
         combine([], LOST_M)

@@ -39,6 +39,14 @@ def test_a_pair_that_begins_near_has_collided() -> None:
     assert figures(places([0.0] * 3, [1.0, 1.0, 5.0]), collision_m=0.5)["collisions"] == 0.0
 
 
+def test_who_hears_only_some_is_connected_if_there_is_a_way_back() -> None:
+    still = places([0.0] * 2, [5.0] * 2, [9.0] * 2)
+    ring, line = np.zeros((3, 3), dtype=bool), np.zeros((3, 3), dtype=bool)
+    ring[[0, 1, 2], [1, 2, 0]] = True
+    line[[0, 1], [1, 2]] = True
+    assert figures(still, heard=np.array([ring, line]))["connected_share"] == 0.5
+
+
 def test_three_that_meet_are_three_pairs() -> None:
     assert figures(places([0.0, 0.0], [9.0, 1.0], [-9.0, 0.5]))["collisions"] == 3.0
 

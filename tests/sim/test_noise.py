@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from sim.noise import generator, normal_rows
+from sim.noise import generator, normal_rows, uniform_rows
 
 SEEDS = st.integers(0, 2**40)
 
@@ -17,6 +17,14 @@ def test_a_row_does_not_depend_on_how_many_are_drawn(seed: int, some: int, more:
     rows, longer = normal_rows(seed, some, size, "r1", "range"), normal_rows(seed, some + more, size, "r1", "range")
     assert rows.shape == (some, size)
     np.testing.assert_array_equal(rows, longer[:some])
+
+
+@given(SEEDS, st.integers(1, 40), st.integers(1, 40))
+def test_a_uniform_row_does_not_either(seed: int, some: int, more: int) -> None:
+    rows, longer = uniform_rows(seed, some, 4, "c1", "camera"), uniform_rows(seed, some + more, 4, "c1", "camera")
+    np.testing.assert_array_equal(rows, longer[:some])
+    assert rows.min() >= 0.0
+    assert rows.max() < 1.0
 
 
 @given(SEEDS, st.permutations([("r1", "range"), ("r1", "pose"), ("r2", "range"), ("t1", "control")]))

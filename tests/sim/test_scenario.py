@@ -33,7 +33,7 @@ def robot(scenario: Scenario, name: str) -> Any:
 
 @pytest.mark.parametrize("name", bundled())
 def test_every_bundled_scenario_loads(name: str) -> None:
-    scenario = load(name, ["world.path=/somewhere"] if name.startswith(("utias", "tiers")) else [])
+    scenario = load(name, ["world.path=/somewhere"] if name.startswith(("utias", "tiers", "drone")) else [])
     assert scenario.name == name
     assert scenario.window_s[1] <= scenario.duration_s
 
@@ -159,6 +159,12 @@ MISTAKES: list[tuple[str, list[str]]] = [
     ),
     ("robots.r1.autopilot.mode=OFFBOARD", ["robots.r1.autopilot.mode: 'OFFBOARD'", "GUIDED"]),
     ("robots.r1.autopilot={flavour='px4',mode='GUIDED'}", ["robots.r1.autopilot.mode: 'GUIDED'", "OFFBOARD"]),
+    ("links={nearest=2,rewire=2}", ["links.nearest and links.rewire", "state one, as links = { rewire = 2 }"]),
+    ("links.nearest=0", ["'links.nearest' = 0", "greater than or equal to 1"]),
+    ("robots.r2.sensors.range.noise=isotropic", ["sensors.range.noise", "bearing3", "leave it out"]),
+    ("robots.r2.sensors.range.false_share=0.1", ["sensors.range.false_share", "bearing3", "leave it out"]),
+    ("robots.r1.sensors.pose.detects=0.5", ["sensors.pose.detects", "not of 'pose'"]),
+    ("targets.t1.course={kind='circle'}", ["targets.t1.course", "'unicycle'", "take 'constant_velocity_3d'"]),
     ("world.placement.reaches=r9", ["world.placement.reaches = 'r9'", "r1, r2, r3, r4"]),
     ('world={kind="recording"}', ["world.path is missing", "--set world.path="]),
     ('world={kind="simulated"}', ["robots.r1.start.circle", "[world.placement]"]),
@@ -220,6 +226,11 @@ def test_a_recording_needs_its_path_and_has_no_more_than_it_holds() -> None:
     recorded = target.replace('"t1",', '"t1",recorded=true,')
     assert "nobody knows of" in complaint(path, recorded, name="utias-all")
     assert "recorded = false is needed in a simulated world" in complaint(recorded)
+    moving = recorded.replace("{position_m=1.0,heading_rad=1.0}", "{position_m=1.0,velocity_mps=1.0}")
+    moving = moving.replace("recorded=true,", "recorded=true,model='constant_velocity',course={kind='circle'},")
+    assert "targets.t1.course does not go with a recording" in complaint(path, moving, name="utias-all")
+    missing = "robots.*.sensors.mates.detects=0.5"
+    assert "sensors.mates.detects does not go with a recording" in complaint(path, missing, name="utias-all")
 
 
 def test_a_file_that_is_not_there_not_a_file_or_not_toml(tmp_path: Path) -> None:

@@ -12,7 +12,14 @@ from sim.scenario_file import load
 from sim.summary import faults, reduce, summarize, unmet
 from sim.trial import run_trial
 
-FLEET = {"position_rmse_m", "heading_rmse_rad", "anees", "target_position_rmse_m", "target_anees"}
+FLEET = {
+    "position_rmse_m",
+    "heading_rmse_rad",
+    "anees",
+    "target_position_rmse_m",
+    "target_velocity_rmse_mps",
+    "target_anees",
+}
 
 
 def short(*overrides: str) -> Scenario:
@@ -94,6 +101,8 @@ def test_without_the_bound_there_is_no_such_key() -> None:
 def test_what_was_injected_is_said_in_words() -> None:
     made = short("links.loss=0.25", "links.delay_s=0.1", "links.duplicate=0.5")
     assert faults(made) == ["loss 0.25", "delay 0.1 s + tail 0 s", "duplicate 0.5"]
+    assert faults(short("links.nearest=2")) == ["only the nearest 2 are heard"]
+    assert faults(short("links.rewire=1")) == ["1 are heard, others at every step"]
 
 
 def test_exits_of_processes_are_kept() -> None:

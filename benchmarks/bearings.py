@@ -1,0 +1,132 @@
+"""Filters that triangulate, side by side: `python -m benchmarks.bearings`.
+
+Plays `stt-circle` and `stt-square` with every kind of `tracking.kind`, with the published layout of cameras and with
+ones drawn anew for each trial, all kinds on the same data, and prints a table in Markdown, with the centralized filters
+on top: the published one, and ours. Published kinds tell their track from the first bearing on. Trials that are
+finished stay in the output directory, so that an interrupted run goes on where it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.runs import run
+
+SCENARIOS = ("stt-circle", "stt-square")
+PUBLISHED = ("stt", "tkf", "cmkf", "hcmci", "cikf")
+IMPROVED = ("kcf_plus", "icf_plus")
+RANDOM = (
+    "robots.*.start={pose = [0.0, 0.0, 0.0, 0.0], spread = [40.0, 40.0, 20.0, 3.1415926], "
+    "error = [0.0, 0.0, 0.0, 0.0]}"
+)
+"""Cameras drawn evenly in a box of 80 x 80 x 40 m."""
+
+FAULTS = (
+    "links.loss=0.3",
+    "links.delay_tail_s=0.1",
+    "robots.*.sensors.camera.detects=0.8",
+    "robots.*.sensors.camera.false_share=0.05",
+)
+TAIL_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Figures of one kind over all trials, robots and instants at which it tells a track.
+
+    all_m, tail_m   RMSE of the place, from the start on and from 10 s on
+    velocity_mps    RMSE of the velocity
+    anees           per degree of freedom
+    bytes_s         told per robot and second
+    step_us         median wall time of an event of a robot
+    """
+
+    trials: int
+    all_m: float
+    tail_m: float
+    median_m: float
+    velocity_mps: float
+    anees: float
+    bytes_s: float
+    step_us: float
+
+
+def row(summary: dict[str, Any], which: str = "fleet") -> Row:
+    """The figures of a run directory's summary; `which`: `fleet`, or the centralized filter's `bound`."""
+    fleet, series = summary[which], summary["series"]
+    lines = list(series["target_position_rmse_m" if which == "fleet" else "bound_target_position_rmse_m"].values())
+    if which == "fleet":
+        lines = [line for by_robot in lines for line in by_robot.values()]
+    squares = [(t_s, value**2) for line in lines for t_s, value in zip(series["t_s"], line) if value is not None]
+    tail = [square for t_s, square in squares if t_s >= TAIL_S]
+    return Row(
+        summary["trials"],
+        math.sqrt(sum(square for _, square in squares) / len(squares)),
+        math.sqrt(sum(tail) / len(tail)),
+        summary["median"]["target_position_rmse_m"] if which == "fleet" else math.nan,
+        fleet["target_velocity_rmse_mps"],
+        fleet["target_anees"],
+        summary["network"]["bytes_per_robot_s"] if which == "fleet" else math.nan,
+        summary["timing"]["step_us_median"] if which == "fleet" else math.nan,
+    )
+
+
+HEADS = ("filter", "place [m]", "from 10 s on", "median trial", "velocity [m/s]", "ANEES", "bytes/s", "event [us]")
+
+
+def table(rows: dict[str, Row], what: str) -> str:
+    """Rows in Markdown under a heading."""
+    lines = [f"**{what}**", "", f"| {' | '.join(HEADS)} |", f"|{' --- |' * len(HEADS)}"]
+    for name, found in rows.items():
+        cells = [found.all_m, found.tail_m, found.median_m, found.velocity_mps, found.anees]
+        shown = ["" if math.isnan(cell) else f"{cell:.2f}" for cell in cells]
+        shown += ["" if math.isnan(cell) else f"{cell:.0f}" for cell in (found.bytes_s, found.step_us)]
+        lines.append(f"| `{name}` | {' | '.join(shown)} |")
+    return "\n".join([*lines, ""])
+
+
+def parser() -> argparse.ArgumentParser:
+    found = argparse.ArgumentParser(prog="python -m benchmarks.bearings", description=__doc__)
+    found.add_argument("--trials", type=int, default=10)
+    found.add_argument("--seed", type=int, default=1)
+    found.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="trials played at once")
+    found.add_argument("--kinds", nargs="+", default=[*PUBLISHED, *IMPROVED], choices=[*PUBLISHED, *IMPROVED])
+    found.add_argument("--layouts", nargs="+", default=["fixed", "random"], choices=["fixed", "random", "faults"])
+    found.add_argument("--scenarios", nargs="+", default=list(SCENARIOS), choices=SCENARIOS)
+    found.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
+    found.add_argument("--out", type=Path, default=Path("runs/bearings"), help="where finished trials are")
+    return found
+
+
+def main(arguments: list[str] | None = None) -> int:
+    options = parser().parse_args(arguments)
+    for scenario in options.scenarios:
+        for layout in options.layouts:
+            rows: dict[str, Row] = {}
+            for kind in options.kinds:
+                improved = kind in IMPROVED
+                changes = [f"tracking.kind={kind}", *([] if improved else ["tracking.parallax_rad=0"])]
+                changes += [] if layout == "fixed" else [RANDOM]
+                changes += FAULTS if layout == "faults" else ()
+                command = ["montecarlo", scenario, "--trials", str(options.trials), "--seed", str(options.seed)]
+                command += ["--jobs", str(options.jobs), "--no-report", "--bound"]
+                for change in [*changes, *options.overrides]:
+                    command += ["--set", change]
+                out = options.out / f"{scenario}-{layout}-{kind}-{options.seed}-{options.trials}"
+                run(command, out)
+                summary = json.loads((out / "summary.json").read_text())
+                rows.setdefault("central_plus" if improved else "ckf", row(summary, "bound"))
+                rows[kind] = row(summary)
+            print(table(rows, f"{scenario}, {layout}, {options.trials} trials"), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
