@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
-from agent.config_file import ConfigError, Finite, Id, Part, Positive
+from agent.config_file import ConfigError, Finite, Id, NotNegative, Part, Positive
 from agent.config_parts import LocalizationPart, SigmaPart, held_altitude
 from agent.estimation.motion import LAYOUTS, SPATIAL, TargetMotion
 from agent.motion_parts import ControlNoisePart, ControlPart
@@ -37,7 +36,7 @@ class TrackingPart(Part):
 
     kind: Literal["clat", "stt", "cmkf", "cikf", "hcmci", "tkf", "kcf_plus", "icf_plus", "none"] = "clat"
     memory_s: Positive | None = None
-    parallax_rad: Annotated[float, Field(ge=0.0, lt=1.5)] = 0.1
+    parallax_rad: NotNegative = 0.1
     start_within_m: Positive | None = None
     end_after_s: Positive | None = None
     end_above_m: Positive | None = None

@@ -298,6 +298,9 @@ def trial_figures(reduced: dict[str, Any]) -> dict[str, Any]:
     """One trial as a row: fleet figures, each robot's position RMSE and NEES, and what all robots make of each target.
     """
     row = fleet_figures([reduced])
+    if row["target_velocity_rmse_mps"] is None:
+        # Targets whose state has no velocity.
+        del row["target_velocity_rmse_mps"]
     for name, item in reduced["robots"].items():
         row[f"{name}_position_rmse_m"] = _rmse([item])
         row[f"{name}_nees"] = _anees([item])
