@@ -245,11 +245,13 @@ def _check_course(where: str, target: TargetPart) -> None:
     if target.course is None:
         return
     try:
-        target.course.check(target.model)
+        target.course.check(target.model, target.start.pose)
     except ConfigError as error:
         raise ConfigError(f"{where}.{error}") from None
     if target.recorded:
         raise ConfigError(f"{where}.course does not go with a recording, where it went its way already; leave it out")
+    if target.course.kind == "wander" and target.start.spread:
+        raise ConfigError(f"{where}.start.spread does not go with a course of kind 'wander'; leave it out")
 
 
 def _check_recorded(where: str, sensor: SensorPart) -> None:
