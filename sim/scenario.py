@@ -155,13 +155,24 @@ class VehiclePart(Part):
     `min_speed_mps` below 0: it drives backwards too; above 0: it cannot stand still. Without `max_acceleration_mps2`
     its speed changes at once. It `turns` along its way, on an arc, or after it: straight on, and then on the spot, as
     the discrete unicycle of publications does in each step.
+
+    One that `flies` goes in any direction, and stands still in the air: `max_speed_mps` is level, `max_climb_mps` up
+    and down (absent: as fast), and its velocity changes by `max_acceleration_mps2` whatever way.
     """
+
+    flies: bool = False
+    max_climb_mps: Positive | None = None
 
     max_speed_mps: Positive = PLAIN.max_speed_mps
     max_turn_radps: Positive = PLAIN.max_turn_radps
     max_acceleration_mps2: Positive | None = None
     min_speed_mps: Finite = 0.0
     turns: Literal["along", "after"] = "along"
+
+    @property
+    def climb_mps(self) -> float:
+        """How fast it climbs and sinks."""
+        return self.max_speed_mps if self.max_climb_mps is None else self.max_climb_mps
 
 
 class AutopilotPart(Part):

@@ -203,6 +203,15 @@ def _check_planning(scenario: Scenario) -> None:
                 f"{where}.vehicle.min_speed_mps = {vehicle.min_speed_mps:g} is above max_speed_mps = "
                 f"{vehicle.max_speed_mps:g}; lower it"
             )
+        if vehicle.flies and robot.model != "planar_altitude":
+            raise ConfigError(f"{where}.vehicle.flies needs model = 'planar_altitude', not '{robot.model}'; change one")
+        if vehicle.max_climb_mps is not None and not vehicle.flies:
+            raise ConfigError(f"{where}.vehicle.max_climb_mps is of a vehicle that flies; set vehicle.flies = true")
+        if vehicle.flies and (vehicle.min_speed_mps != 0.0 or vehicle.turns != "along"):
+            raise ConfigError(
+                f"{where}.vehicle: one that flies stands still in the air and turns as it likes; leave min_speed_mps "
+                "and turns out"
+            )
     for robot in scenario.planners():
         where, kind = f"{scenario.name}: robots.{robot.id}", scenario.planning_of(robot).kind
         if scenario.world.kind == "recording":

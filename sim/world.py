@@ -17,7 +17,7 @@ from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, OutOfVi
 from agent.estimation.odometry import OdometryNoise
 from agent.settings import NS, nanoseconds
 from agent.timeline import Phase
-from sim.closed_loop import ClosedLoop, Motion, increment, planar_of
+from sim.closed_loop import ClosedLoop, Motion, planar_of
 from sim.directions import DRAWS, anywhere, direction_covariance, disturbed
 from sim.motion import driven
 from sim.noise import generator, normal_rows, uniform_rows
@@ -96,7 +96,7 @@ def control_odometry(robot: RobotPart, step_s: float) -> OdometryNoise:
     """The odometry noise a robot's estimator assumes: stated, or that of its control noise."""
     if robot.odometry is not None:
         return robot.odometry.noise()
-    return robot.noise.odometry(step_s)
+    return robot.noise.odometry(step_s, robot.vehicle.flies)
 
 
 def order(output: Output) -> tuple[int, int, str, str]:
@@ -167,8 +167,8 @@ class SimulatedWorld:
         self.motion = Motion()
         for robot in scenario.planners():
             states = self.motion.states[robot.id] = self._tracks[robot.id]
-            states[1:, planar_of(robot)] = np.nan
-            self.motion.moved[robot.id] = np.full((self.steps, 3), np.nan)
+            states[1:, slice(None) if robot.vehicle.flies else planar_of(robot)] = np.nan
+            self.motion.moved[robot.id] = np.full((self.steps, 4), np.nan)
         self.closed_loop = bool(self.motion.states) and not played
         self._loop = ClosedLoop(scenario, self.motion, seed, self.step_ns) if self.closed_loop else None
         movers = scenario.movers()
@@ -233,7 +233,7 @@ class SimulatedWorld:
             speed, yaw_rate = self._commands[robot.id][k - 1]
         delta = dt * np.array([speed, 0.0, control.climb_mps, yaw_rate])
         if robot.id in self.motion.moved:
-            delta = increment(robot, self.motion.moved[robot.id][k - 1], dt)
+            delta = self.motion.moved[robot.id][k - 1].copy()
         noise = self._odometry_noise[robot.id]
         if LAYOUTS[robot.model] is UNICYCLE_GAINS:
             delta[[0, 1, 3]] = reported(self._tracks[robot.id][k - 1], delta[[0, 1, 3]])
