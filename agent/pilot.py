@@ -28,6 +28,9 @@ Array = NDArray[np.float64]
 
 FAR_FUTURE_NS = 2**62
 
+LEAST_HELD_NS = 500_000_000
+"""A command lasts so long at least: of quick rounds a few may be lost before the vehicle stops."""
+
 FALLBACK_ROUNDS = 5
 """After a plan that took too long, so many are made by the fallback."""
 
@@ -38,7 +41,10 @@ class Pilot:
     def __init__(self, settings: AgentSettings, counters: Counter[str]) -> None:
         self._settings, self._counters = settings, counters
         self._planner = build_planner(settings.planning, settings.robot)
-        self._fallback = build_planner(replace(settings.planning, kind="potential", form="improved"), settings.robot)
+        # Who flies has no simpler law, and hardly needs one: it tries nothing out.
+        simpler = replace(settings.planning, kind="potential", form="improved")
+        flies = settings.planning.kind == "encircle"
+        self._fallback = self._planner if flies else build_planner(simpler, settings.robot)
         self._motions = {target.id: target.motion for target in settings.targets}
         self._clocks = PairClocks(settings)
         self._clock = RoundClock(settings.round, settings.start_ns)
@@ -88,6 +94,9 @@ class Pilot:
         due_ns = self._clock.due(source.complete_ns + tolerance)
         if due_ns is not None:
             estimate = source.estimate()
+            if self._open_ns is not None and estimate is not None:
+                # Neighbours were waited for until the next round: the plan is made with what there is.
+                effects.append(self._steer(self._open_ns, estimate))
             self._counters["plan.skipped"] += self._clock.open(due_ns)
             self._open_ns = due_ns
             if estimate is not None and not self._lean:
@@ -128,8 +137,9 @@ class Pilot:
         assert planner is not None
         command = planner.command(self._situation(t_ns, index, estimate))
         round_ = self._settings.round
-        until_ns = t_ns + 2 * (round_.period_ns + round_.wait_ns)
-        self._last = Steer((command.speed_mps, 0.0, 0.0), command.yaw_rate_radps, until_ns)
+        until_ns = t_ns + max(2 * (round_.period_ns + round_.wait_ns), LEAST_HELD_NS)
+        velocity = command.speed_mps, command.left_mps, command.up_mps
+        self._last = Steer(velocity, command.yaw_rate_radps, until_ns)
         self._counters["plan.simple" if simple else "plan.made"] += 1
         return self._last
 
@@ -164,6 +174,7 @@ class Pilot:
             report.yaw_rate,
             tuple(view for view in views if view is not None),
             max(0, age_ns) * 1e-9,
+            0.0 if layout.altitude is None else float(report.belief.mean[layout.altitude]),
         )
 
     def _view(self, told: TargetBelief) -> TargetView | None:
@@ -177,6 +188,7 @@ class Pilot:
         return {
             "kind": self._settings.planning.kind,
             "speed_mps": self._last.velocity_mps[0],
+            "velocity_mps": list(self._last.velocity_mps),
             "yaw_rate_radps": self._last.yaw_rate_radps,
             "neighbours": [told.peer for told in self._neighbours.newest(RoundStage.POSTERIOR, self._clock.next_ns)],
             "refused": self._refused,

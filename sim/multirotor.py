@@ -58,7 +58,7 @@ class Multirotor:
         return np.array(moved)
 
     def _fly(self, moved: list[float], seconds: float) -> None:
-        """Add a part to `moved`. The velocity is in the level body frame, so it turns the other way as the nose does."""
+        """Add a part to `moved`. Velocities are in the level body frame: they turn the other way as the nose does."""
         ahead, left, up, rate = self._wanted
         cos, sin = math.cos(rate * seconds), math.sin(rate * seconds)
         x, y, z = self._velocity

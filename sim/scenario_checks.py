@@ -194,6 +194,11 @@ def _check_planning(scenario: Scenario) -> None:
                 planning = planning.model_copy(update={"radio_range_m": scenario.links.range_m})
                 source = "; planning.radio_range_m is not stated, which is links.range_m then"
             planning.settings()
+            planning.check_model(robot.model, [(target.id, target.model) for target in scenario.targets])
+            if planning.kind == "encircle" and not robot.vehicle.flies:
+                raise ConfigError(
+                    f"robots.{robot.id}: planning.kind = 'encircle' is of vehicles that fly; set vehicle.flies = true"
+                )
     except ConfigError as error:
         raise ConfigError(f"{scenario.name}: {error}{source}") from None
     for robot in scenario.robots:
