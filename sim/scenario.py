@@ -121,8 +121,9 @@ class SensorPart(Part):
     `max_range_m`, nearer than `min_range_m` or out of the field of view `fov_rad`, which is centred on the sensor's
     forward axis. Simulated ranges are too long by `bias_m`, or by what `bias_of` says of the subject. Directions
     (`bearing3`) err by `noise`, see `sim.directions`. Who could be seen is detected with the probability `detects`; the
-    share `false_share` of detections is of a direction drawn evenly. A recorded camera has the mount and intrinsics of
-    the recording.
+    share `false_share` of detections is of a direction drawn evenly. With a `gimbal` the field of view is a cone about
+    where the camera saw a target last, see `sim.gimbal`. A recorded camera has the mount and intrinsics of the
+    recording.
     """
 
     kind: SensorKind | None = None
@@ -140,6 +141,7 @@ class SensorPart(Part):
     max_range_m: Positive | None = None
     min_range_m: NotNegative = 0.0
     fov_rad: Positive | None = None
+    gimbal: bool = False
     rate_hz: Positive | None = None
     mount: MountVector = [0.0, 0.0, 0.0]
     intrinsics: IntrinsicsPart = IntrinsicsPart()

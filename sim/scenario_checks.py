@@ -7,6 +7,7 @@ from agent.config_file import (
 )
 from agent.config_parts import MAX_TEAM
 from agent.estimation.motion import LAYOUTS
+from agent.estimation.mounting import mount_of
 from agent.estimation.observation import RELATIVE_ANGLES
 from agent.fault_parts import AnyFaultPart, SensorDelayPart, SensorFaultPart, check_faults, named
 from agent.joint_room import check_room
@@ -270,7 +271,7 @@ def _check_course(where: str, target: TargetPart) -> None:
 
 def _check_recorded(where: str, sensor: SensorPart) -> None:
     """What a recorded sensor said is not made worse."""
-    for key in ("noise", "detects", "false_share"):
+    for key in ("noise", "detects", "false_share", "gimbal"):
         if getattr(sensor, key) != getattr(SensorPart(), key):
             raise ConfigError(f"{where}.{key} does not go with a recording, which is as it is; leave it out")
 
@@ -311,7 +312,13 @@ def check_sensor(where: str, name: str, sensor: SensorPart) -> None:
         raise ConfigError(f"{where}: sigma_px is missing")
     if kind in RELATIVE_ANGLES and not sensor.of:
         raise ConfigError(f'{where}: of is missing, for instance of = ["peers"]')
+    if sensor.gimbal and (sensor.fov_rad is None or sensor.of != ["targets"] or any(mount_of(sensor.mount)[3:])):
+        raise ConfigError(
+            f"{where}.gimbal is of a camera that turns to targets within its field of view; state fov_rad and "
+            'of = ["targets"], and no angles in mount'
+        )
     for key, kinds in (
+        ("gimbal", ("bearing3",)),
         ("noise", ("bearing3",)),
         ("detects", tuple(RELATIVE_ANGLES)),
         ("false_share", ("bearing", "bearing3")),

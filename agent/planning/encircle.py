@@ -59,7 +59,7 @@ def slots_of(places: Array, target: Array, radius_m: float) -> Array:
     apart = places - target
     azimuths = ring(np.arctan2(apart[:, 1], apart[:, 0]))
     level = radius_m * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
-    return target + np.column_stack([level, np.full(len(places), HEIGHT_SHARE * radius_m)])
+    return np.asarray(target + np.column_stack([level, np.full(len(places), HEIGHT_SHARE * radius_m)]))
 
 
 @dataclass(frozen=True, slots=True)
