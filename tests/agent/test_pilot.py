@@ -122,6 +122,17 @@ def test_a_robot_that_was_held_up_plans_once_and_for_the_present() -> None:
     assert agent.counters["round.skipped"] == agent.counters["plan.skipped"] == 7
 
 
+def test_a_plan_is_made_though_the_next_round_begins_while_neighbours_are_waited_for() -> None:
+    """Of quick rounds over slow links what neighbours told after their corrections may always come too late."""
+    agent = Agent(planning(round=replace(ROUND, wait_ns=55 * NS // 100)))
+    made(agent, LinkChange(0, "r2", True, 1, 1))
+    for k in range(4):
+        made(agent, *([drive(k, 0.1)] if k else []), heard(report(RoundStage.PRIOR, (-8.0, 0.0)), k * NS, seq=k))
+        agent.handle(Tick(k * NS))
+    assert agent.counters["plan.made"] == 3
+    assert agent.counters["plan.skipped"] == 0
+
+
 def test_a_report_from_the_future_is_not_waited_by() -> None:
     agent = Agent(planning())
     far = Message(Header("r2", 1, 1, 0, 100 * NS, 0), report(RoundStage.POSTERIOR, (3.0, 0.0)))
