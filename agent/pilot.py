@@ -18,6 +18,7 @@ from agent.estimation.motion import STATES
 from agent.events import LinkChange, Observation, Received
 from agent.lookout import Lookout
 from agent.pair_clock import PairClocks
+from agent.peer_tables import remember
 from agent.planning.choice import build_planner
 from agent.planning.situation import Member, Situation, TargetView
 from agent.rounds import Neighbours, RoundClock, Told
@@ -30,6 +31,9 @@ FAR_FUTURE_NS = 2**62
 
 LEAST_HELD_NS = 500_000_000
 """A command lasts so long at least: of quick rounds a few may be lost before the vehicle stops."""
+
+SILENT_NS = 60_000_000_000
+"""Who flies keeps off the place where another one was heard last for so long: it may hover there."""
 
 FALLBACK_ROUNDS = 5
 """After a plan that took too long, so many are made by the fallback."""
@@ -50,6 +54,7 @@ class Pilot:
         self._clock = RoundClock(settings.round, settings.start_ns)
         self._neighbours = Neighbours(settings.round)
         self._lookout = Lookout(settings)
+        self._placed: dict[str, tuple[int, Member]] = {}
         self._lean = settings.round.lean and settings.localization.kind == "jlatt"
         self._open_ns: int | None = None
         self._simple_until = 0
@@ -153,11 +158,26 @@ class Pilot:
                     newest[told.peer] = told
         self._lookout.place(estimate)
         found = [self._member(told.peer, told.report, t_ns - told.t_ns) for told in newest.values()]
-        others = [other for other in found if other is not None] + self._lookout.members(t_ns, set(newest))
+        others = [other for other in found if other is not None]
+        if self._settings.planning.kind == "encircle":
+            silent = self._silent(t_ns, set(newest))
+            for other in others:
+                remember(self._placed, other.robot, (newest[other.robot].t_ns, other))
+            others += silent
+        else:
+            others += self._lookout.members(t_ns, set(newest))
         me = self._member(self._settings.robot, self._report(estimate), 0)
         assert me is not None
         dt_s = self._settings.round.period_ns * 1e-9
         return Situation(index, dt_s, me, tuple(sorted(others, key=lambda other: other.robot)))
+
+    def _silent(self, t_ns: int, heard: set[str]) -> list[Member]:
+        """Those who have told nothing lately, where they told to be last."""
+        return [
+            replace(member, targets=(), age_s=(t_ns - told_ns) * 1e-9, silent=True)
+            for peer, (told_ns, member) in self._placed.items()
+            if peer not in heard and t_ns - told_ns <= SILENT_NS
+        ]
 
     def _member(self, robot: str, report: RoundReport, age_ns: int) -> Member | None:
         """A robot as a planner sees it; None if it has no heading."""

@@ -75,8 +75,8 @@ class Encircle:
     """The planner of one pursuer.
 
     It goes with the target as fast as that is believed to go, and on to its slot; keeps `closest_m` off the target and
-    all it knows of; and faces the target. A target that is not known, or not well enough, is not flown after: it hovers
-    and turns slowly.
+    all it knows of, those who have fallen silent too; and faces the target. A target that is not known, or not well
+    enough, is not flown after: it hovers and turns slowly.
     """
 
     radius_m: float
@@ -94,7 +94,7 @@ class Encircle:
         if target is None:
             wanted = self._clear(np.zeros(3), here, bodies, np.zeros_like(bodies))
             return self._limited(wanted, own, min(SEARCH_TURN_RADPS, self.max_turn_radps))
-        team = sorted((own, *others), key=lambda member: member.robot)
+        team = sorted((own, *(other for other in others if not other.silent)), key=lambda member: member.robot)
         slots = slots_of(np.array([member.place for member in team]), target.place, self.radius_m)
         slot = slots[[member.robot for member in team].index(own.robot)]
         wanted = self._saturated(target.velocity + FOLLOW_GAIN * (slot - here))

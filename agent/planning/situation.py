@@ -31,6 +31,7 @@ class Member:
     """A robot of the team: pose (3,) x, y, heading with cov (3, 3), last known command, what it believes of targets.
 
     `age_s`: how old all of this is. The own one is of the present. `altitude_m` is 0 of who lies in the plane.
+    `silent`: it was heard there last, and is no longer counted on.
     """
 
     robot: str
@@ -41,6 +42,7 @@ class Member:
     targets: tuple[TargetView, ...] = ()
     age_s: float = 0.0
     altitude_m: float = 0.0
+    silent: bool = False
 
     @property
     def place(self) -> Array:

@@ -133,6 +133,19 @@ def test_a_plan_is_made_though_the_next_round_begins_while_neighbours_are_waited
     assert agent.counters["plan.skipped"] == 0
 
 
+def test_who_flies_keeps_off_the_place_where_another_one_fell_silent() -> None:
+    """It may hover there: for a minute, then it is forgotten."""
+    agent = Agent(replace(planning(), planning=PlanningSettings(kind="encircle", closest_m=6.0)))
+    made(agent, LinkChange(0, "r2", True, 1, 1), Tick(0), heard(report(RoundStage.POSTERIOR, (3.0, 0.0)), 0))
+    speeds = {}
+    for k in (20, 59, 62):
+        made(agent, *(drive(j, 0.0) for j in range(max(speeds, default=0) + 1, k + 1)))
+        found = made(agent, Tick(k * NS), Tick(k * NS + WAIT), Tick(k * NS + 2 * WAIT))
+        speeds[k] = steers(found)[-1].velocity_mps[0]
+    assert speeds[20] < -0.1 and speeds[59] < -0.1
+    assert speeds[62] == 0.0
+
+
 def test_a_report_from_the_future_is_not_waited_by() -> None:
     agent = Agent(planning())
     far = Message(Header("r2", 1, 1, 0, 100 * NS, 0), report(RoundStage.POSTERIOR, (3.0, 0.0)))

@@ -153,6 +153,16 @@ def test_who_sees_nothing_follows_what_another_tells_moved_on_to_the_present() -
     np.testing.assert_allclose(told, knows, atol=1e-9)
 
 
+def test_who_has_fallen_silent_is_kept_clear_of_and_has_no_slot() -> None:
+    target = np.array([0.0, 0.0, 5.0, 0.0, 0.0, 0.0])
+    slots = slots_of(np.array([[9.0, 1.0, 12.0], [-5.0, 8.0, 12.0]]), target[:3], RADIUS)
+    own, other = member("r1", slots[0], 0.0, view(target)), member("r2", slots[1])
+    beside = replace(member("r0", slots[0] + np.array([0.0, 3.0, 0.0])), silent=True)
+    far = replace(beside, pose=np.array([40.0, 0.0, 0.0]))
+    np.testing.assert_allclose(over_ground(chosen(own, far, other), 0.0), 0.0, atol=1e-9)
+    assert over_ground(chosen(own, beside, other), 0.0)[1] == pytest.approx(-0.5 * (CLOSEST - 3.0))
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e9])
 def test_what_peers_tell_cannot_hurt(bad: float) -> None:
     slot = np.array([RADIUS, 0.0, 5.0 + RADIUS * HEIGHT_SHARE])
