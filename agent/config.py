@@ -297,6 +297,7 @@ def load_agent_config(path: Path) -> AgentConfig:
         config.health.settings(config.localization.form)
         config.round.settings()
         config.planning.settings()
+        config.planning.check_model(config.motion.model, [(target.id, target.model) for target in config.targets])
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     if config.localization.kind == "replica" and not config.team:

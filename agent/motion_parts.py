@@ -40,11 +40,15 @@ class ControlNoisePart(Part):
             math.hypot(self.yaw_rate_radps, self.yaw_rate_per_mps * speed_mps),
         )
 
-    def odometry(self, step_s: float) -> OdometryNoise:
-        """The noise of an odometry that reports what is commanded, once per step."""
+    def odometry(self, step_s: float, sideways: bool = False) -> OdometryNoise:
+        """The noise of an odometry that reports what is commanded, once per step.
+
+        `sideways`: of a vehicle that moves to the side as well, and is as unsure there.
+        """
         root = math.sqrt(step_s)
         return OdometryNoise(
             along_m_per_sqrt_s=self.speed_mps * root,
+            across_m_per_sqrt_s=self.speed_mps * root if sideways else 0.0,
             along_share=self.speed_share,
             vertical_m_per_sqrt_s=self.climb_mps * root,
             heading_rad_per_sqrt_s=self.yaw_rate_radps * root,

@@ -18,6 +18,7 @@ from agent.estimation.motion import STATES
 from agent.events import LinkChange, Observation, Received
 from agent.lookout import Lookout
 from agent.pair_clock import PairClocks
+from agent.peer_tables import remember
 from agent.planning.choice import build_planner
 from agent.planning.situation import Member, Situation, TargetView
 from agent.rounds import Neighbours, RoundClock, Told
@@ -27,6 +28,12 @@ from network.messages import Belief, Channel, RoundReport, RoundStage, TargetBel
 Array = NDArray[np.float64]
 
 FAR_FUTURE_NS = 2**62
+
+LEAST_HELD_NS = 500_000_000
+"""A command lasts so long at least: of quick rounds a few may be lost before the vehicle stops."""
+
+SILENT_NS = 60_000_000_000
+"""Who flies keeps off the place where another one was heard last for so long: it may hover there."""
 
 FALLBACK_ROUNDS = 5
 """After a plan that took too long, so many are made by the fallback."""
@@ -38,12 +45,16 @@ class Pilot:
     def __init__(self, settings: AgentSettings, counters: Counter[str]) -> None:
         self._settings, self._counters = settings, counters
         self._planner = build_planner(settings.planning, settings.robot)
-        self._fallback = build_planner(replace(settings.planning, kind="potential", form="improved"), settings.robot)
+        # Who flies has no simpler law, and hardly needs one: it tries nothing out.
+        simpler = replace(settings.planning, kind="potential", form="improved")
+        flies = settings.planning.kind == "encircle"
+        self._fallback = self._planner if flies else build_planner(simpler, settings.robot)
         self._motions = {target.id: target.motion for target in settings.targets}
         self._clocks = PairClocks(settings)
         self._clock = RoundClock(settings.round, settings.start_ns)
         self._neighbours = Neighbours(settings.round)
         self._lookout = Lookout(settings)
+        self._placed: dict[str, tuple[int, Member]] = {}
         self._lean = settings.round.lean and settings.localization.kind == "jlatt"
         self._open_ns: int | None = None
         self._simple_until = 0
@@ -88,6 +99,9 @@ class Pilot:
         due_ns = self._clock.due(source.complete_ns + tolerance)
         if due_ns is not None:
             estimate = source.estimate()
+            if self._open_ns is not None and estimate is not None:
+                # Neighbours were waited for until the next round: the plan is made with what there is.
+                effects.append(self._steer(self._open_ns, estimate))
             self._counters["plan.skipped"] += self._clock.open(due_ns)
             self._open_ns = due_ns
             if estimate is not None and not self._lean:
@@ -128,8 +142,9 @@ class Pilot:
         assert planner is not None
         command = planner.command(self._situation(t_ns, index, estimate))
         round_ = self._settings.round
-        until_ns = t_ns + 2 * (round_.period_ns + round_.wait_ns)
-        self._last = Steer((command.speed_mps, 0.0, 0.0), command.yaw_rate_radps, until_ns)
+        until_ns = t_ns + max(2 * (round_.period_ns + round_.wait_ns), LEAST_HELD_NS)
+        velocity = command.speed_mps, command.left_mps, command.up_mps
+        self._last = Steer(velocity, command.yaw_rate_radps, until_ns)
         self._counters["plan.simple" if simple else "plan.made"] += 1
         return self._last
 
@@ -143,11 +158,26 @@ class Pilot:
                     newest[told.peer] = told
         self._lookout.place(estimate)
         found = [self._member(told.peer, told.report, t_ns - told.t_ns) for told in newest.values()]
-        others = [other for other in found if other is not None] + self._lookout.members(t_ns, set(newest))
+        others = [other for other in found if other is not None]
+        if self._settings.planning.kind == "encircle":
+            silent = self._silent(t_ns, set(newest))
+            for other in others:
+                remember(self._placed, other.robot, (newest[other.robot].t_ns, other))
+            others += silent
+        else:
+            others += self._lookout.members(t_ns, set(newest))
         me = self._member(self._settings.robot, self._report(estimate), 0)
         assert me is not None
         dt_s = self._settings.round.period_ns * 1e-9
         return Situation(index, dt_s, me, tuple(sorted(others, key=lambda other: other.robot)))
+
+    def _silent(self, t_ns: int, heard: set[str]) -> list[Member]:
+        """Those who have told nothing lately, where they told to be last."""
+        return [
+            replace(member, targets=(), age_s=(t_ns - told_ns) * 1e-9, silent=True)
+            for peer, (told_ns, member) in self._placed.items()
+            if peer not in heard and t_ns - told_ns <= SILENT_NS
+        ]
 
     def _member(self, robot: str, report: RoundReport, age_ns: int) -> Member | None:
         """A robot as a planner sees it; None if it has no heading."""
@@ -164,6 +194,7 @@ class Pilot:
             report.yaw_rate,
             tuple(view for view in views if view is not None),
             max(0, age_ns) * 1e-9,
+            0.0 if layout.altitude is None else float(report.belief.mean[layout.altitude]),
         )
 
     def _view(self, told: TargetBelief) -> TargetView | None:
@@ -177,6 +208,7 @@ class Pilot:
         return {
             "kind": self._settings.planning.kind,
             "speed_mps": self._last.velocity_mps[0],
+            "velocity_mps": list(self._last.velocity_mps),
             "yaw_rate_radps": self._last.yaw_rate_radps,
             "neighbours": [told.peer for told in self._neighbours.newest(RoundStage.POSTERIOR, self._clock.next_ns)],
             "refused": self._refused,

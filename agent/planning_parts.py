@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from agent.config_file import ConfigError, NotNegative, Part, Positive
+from agent.estimation.motion import LAYOUTS
 from agent.settings import PlanningSettings, RoundSettings, RoundWeights, SensingSettings, nanoseconds
 
 PLAIN = PlanningSettings()
@@ -59,10 +60,12 @@ class PlanningPart(Part):
     file of an agent.
     """
 
-    kind: Literal["none", "random", "potential", "optimal"] = PLAIN.kind
+    kind: Literal["none", "random", "potential", "optimal", "encircle"] = PLAIN.kind
     form: Literal["improved", "published"] = PLAIN.form
     max_speed_mps: Positive | None = None
     max_turn_radps: Positive | None = None
+    max_climb_mps: Positive | None = None
+    radius_m: Positive = PLAIN.radius_m
     speed_share: NotNegative | None = None
     heading_rad_per_m: NotNegative | None = None
     closest_m: Positive = PLAIN.closest_m
@@ -78,6 +81,22 @@ class PlanningPart(Part):
     sensing: SensingPart | None = None
     seed: Annotated[int, Field(ge=0, lt=2**63)] | None = None
     overrun_s: Positive | None = None
+
+    def check_model(self, model: str, targets: list[tuple[str, str]]) -> None:
+        """Raises `ConfigError` if a robot of `model` cannot move so, or there is nobody to follow among `targets` (id,
+        model).
+        """
+        if self.kind != "encircle":
+            return
+        if model != "planar_altitude":
+            raise ConfigError(
+                f"planning.kind = 'encircle' is of robots that fly, not of the model '{model}'; take 'planar_altitude'"
+            )
+        if not any(LAYOUTS[item].heading is None for _, item in targets):
+            raise ConfigError(
+                "planning.kind = 'encircle' follows a target that moves by a velocity; give one of [[targets]] the "
+                "model 'constant_velocity_3d', or take planning.kind = 'none'"
+            )
 
     def settings(self) -> PlanningSettings:
         """Raises `ConfigError` for distances that do not go together, of the kinds that use them."""
@@ -97,4 +116,10 @@ class PlanningPart(Part):
                     f"planning.{low} = {least:g} is not below planning.{high} = {most:g}; make it smaller, or "
                     f"planning.{high} larger"
                 )
+        # The least any two of three are apart, or any from the target.
+        if self.kind == "encircle" and settings.closest_m >= self.radius_m:
+            raise ConfigError(
+                f"planning.closest_m = {settings.closest_m:g} is not below planning.radius_m = {self.radius_m:g}, and "
+                "the circle would be too tight; make it smaller, or planning.radius_m larger"
+            )
         return settings

@@ -84,9 +84,12 @@ class SensingSettings:
 class PlanningSettings:
     """How a robot chooses its motion (Su 2022, chapter 3; `agent.planning`).
 
-    kind             `none`: it does not; `random`; `potential` (AJLATT-C); `optimal` (AJLATT-O)
+    kind             `none`: it does not; `random`; `potential` (AJLATT-C); `optimal` (AJLATT-O); `encircle`, of robots
+                     that fly (STT 2023, section 7)
     form             of `potential` and `optimal`: `improved`, or as `published`
-    max_speed_mps, max_turn_radps  what the vehicle can do; it never drives backwards
+    max_speed_mps, max_turn_radps  what the vehicle can do; on the ground it never drives backwards
+    max_climb_mps    the same of one that flies, up and down
+    radius_m         of the circle on which `encircle` keeps robots above the target
     speed_share, heading_rad_per_m  deviations of the odometry, as a share of the way and in heading per metre
     closest_m, apart_m  robots and the target push each other off below `apart_m`, and hardest at `closest_m`
     radio_range_m    neighbours are in reach within this distance
@@ -99,10 +102,12 @@ class PlanningSettings:
     overrun_ns       a plan that takes longer took too long
     """
 
-    kind: Literal["none", "random", "potential", "optimal"] = "none"
+    kind: Literal["none", "random", "potential", "optimal", "encircle"] = "none"
     form: Literal["improved", "published"] = "improved"
     max_speed_mps: float = 0.5
     max_turn_radps: float = math.pi / 5.0
+    max_climb_mps: float = 0.5
+    radius_m: float = 10.0
     speed_share: float = 0.0070710678118654755
     heading_rad_per_m: float = 0.0282842712474619
     closest_m: float = 6.0

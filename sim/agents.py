@@ -101,6 +101,7 @@ def planning_table(scenario: Scenario, seed: int, robot: RobotPart) -> dict[str,
     derived: dict[str, Any] = {
         "max_speed_mps": robot.vehicle.max_speed_mps,
         "max_turn_radps": robot.vehicle.max_turn_radps,
+        "max_climb_mps": robot.vehicle.climb_mps,
         "speed_share": odometry.along_share,
         "heading_rad_per_m": odometry.heading_rad_per_m,
         "seed": seed,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from agent.effects import Steer
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import LAYOUTS, PLANAR, compose
+from sim.multirotor import Multirotor
 from sim.noise import normal_rows
 from sim.scenario import RobotPart, Scenario
 from sim.vehicle import Vehicle
@@ -24,10 +25,13 @@ Array = NDArray[np.float64]
 MOTION = "motion.bin"
 """The file of a run directory that `MotionWriter` makes."""
 
+MOVES = 4
+"""Numbers of an increment: forward, left, up [m], yaw [rad]."""
+
 
 @dataclass(slots=True)
 class Motion:
-    """By robot, true states (steps + 1, n), and increments (steps, 3) as its vehicle has carried out what was told.
+    """By robot, true states (steps + 1, n), and increments (steps, 4) as its vehicle has carried out what was told.
 
     NaN of what is not played.
     """
@@ -39,7 +43,7 @@ class Motion:
         """All numbers of instant k: of each robot the state, and the increment that led to it (NaN at the start)."""
         parts = []
         for robot, states in self.states.items():
-            parts += [states[k], self.moved[robot][k - 1] if k else np.full(3, np.nan)]
+            parts += [states[k], self.moved[robot][k - 1] if k else np.full(MOVES, np.nan)]
         return np.concatenate(parts)
 
     def put(self, k: int, row: Array) -> None:
@@ -49,8 +53,8 @@ class Motion:
             n = states.shape[1]
             states[k] = row[place : place + n]
             if k:
-                self.moved[robot][k - 1] = row[place + n : place + n + 3]
-            place += n + 3
+                self.moved[robot][k - 1] = row[place + n : place + n + MOVES]
+            place += n + MOVES
 
 
 class ClosedLoop:
@@ -66,10 +70,18 @@ class ClosedLoop:
         self.played = 0
         robots = {robot.id: robot for robot in scenario.robots}
         self._robots = {name: robots[name] for name in motion.states}
-        self._vehicles = {name: Vehicle(robot.vehicle) for name, robot in self._robots.items()}
+        self._vehicles = {
+            name: Multirotor(robot.vehicle) if robot.vehicle.flies else Vehicle(robot.vehicle)
+            for name, robot in self._robots.items()
+        }
         steps = {name: len(moved) for name, moved in motion.moved.items()}
-        self._noise = {name: robot.noise.odometry(scenario.step_s) for name, robot in self._robots.items()}
-        self._draws = {name: normal_rows(seed, count, 2, name, "control") for name, count in steps.items()}
+        self._noise = {
+            name: robot.noise.odometry(scenario.step_s, robot.vehicle.flies) for name, robot in self._robots.items()
+        }
+        self._draws = {
+            name: normal_rows(seed, count, MOVES if self._robots[name].vehicle.flies else 2, name, "control")
+            for name, count in steps.items()
+        }
 
     def steer(self, robot: str, t_ns: int, steer: Steer) -> None:
         """Raises `ValueError` for a robot without planning."""
@@ -82,22 +94,26 @@ class ClosedLoop:
         if k != self.played + 1:
             raise RuntimeError(f"step {k} of a closed loop after step {self.played}: ask for each step once, in order")
         for name, robot in self._robots.items():
-            moved = self._vehicles[name].advance(k * self._step_ns)
+            moved, flies = self._vehicles[name].advance(k * self._step_ns), robot.vehicle.flies
+            if not flies:
+                moved = increment(robot, moved, self._step_s)
             self.motion.moved[name][k - 1] = moved
-            variances = np.diagonal(self._noise[name].covariance(increment(robot, moved, self._step_s), self._step_s))
-            draw = self._draws[name][k - 1]
-            off = np.sqrt(variances[[0, 3]]) * draw
-            states = self.motion.states[name]
-            planar = planar_of(robot)
-            pose = compose(states[k - 1, planar], moved + np.array([off[0], 0.0, off[1]]))
+            variances = np.diagonal(self._noise[name].covariance(moved, self._step_s))
+            noisy = list(range(MOVES)) if flies else [0, 3]
+            off = np.zeros(MOVES)
+            off[noisy] = np.sqrt(variances[noisy]) * self._draws[name][k - 1]
+            states, planar = self.motion.states[name], planar_of(robot)
+            pose = compose(states[k - 1, planar], (moved + off)[list(PLANAR)])
             pose[2] = wrap(pose[2])
             states[k, planar] = pose
+            if flies:
+                states[k, 2] = states[k - 1, 2] + moved[2] + off[2]
         self.played = k
 
 
 def increment(robot: RobotPart, moved: Array, step_s: float) -> Array:
     """What a vehicle has carried out, (3,), as an odometry tells it, (4,)."""
-    found = np.zeros(4)
+    found = np.zeros(MOVES)
     found[list(PLANAR)] = moved
     found[2] = step_s * robot.control.climb_mps
     return found

@@ -1,4 +1,5 @@
-"""Courses that targets follow whatever happens: pieces of constant turn rate about the vertical, and turns on the spot.
+"""Courses that targets follow whatever happens: pieces of constant turn rate about the vertical, turns on the spot, and
+flight at random (`sim.wander`).
 
 The velocity at instant k is the one that carried the target from instant k - 1 to k, so p(k) = p(k - 1) + dt v(k).
 """
@@ -11,9 +12,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.config_file import ConfigError, Finite, Part, Positive
+from agent.config_file import ConfigError, Finite, Part, Positive, Vector3
 from agent.estimation.motion import LAYOUTS, StateLayout
 from agent.settings import nanoseconds
+from sim.wander import wandered
 
 Array = NDArray[np.float64]
 
@@ -26,27 +28,36 @@ class PiecePart(Part):
     turn_rad: Finite = 0.0
 
 
+KEYS: dict[str, tuple[str, ...]] = {
+    "circle": ("lap_s", "side"),
+    "square": ("turn_every_s", "side"),
+    "pieces": ("pieces",),
+    "wander": ("max_speed_mps", "max_acceleration_mps2", "reach_m", "min_altitude_m"),
+}
+"""The keys of each kind."""
+
+
 class CoursePart(Part):
     """How the velocity of a target turns about the vertical; its size and its climb stay those of the start.
 
     A `circle` takes `lap_s`, to the left unless told otherwise; a `square` has a quarter turn every `turn_every_s`, to
-    the right unless told otherwise; `pieces` are followed again and again.
+    the right unless told otherwise; `pieces` are followed again and again. To `wander` is to fly at random from rest,
+    not faster than `max_speed_mps`, not further than `reach_m` (of each axis) from the start, nor below
+    `min_altitude_m`.
     """
 
-    kind: Literal["circle", "square", "pieces"]
+    kind: Literal["circle", "square", "pieces", "wander"]
     lap_s: Positive = 20.0
     turn_every_s: Positive = 5.0
     side: Literal["left", "right"] | None = None
     pieces: list[PiecePart] = []
+    max_speed_mps: Positive = 2.0
+    max_acceleration_mps2: Positive = 1.0
+    reach_m: Vector3 = [20.0, 20.0, 5.0]
+    min_altitude_m: Finite = 2.0
 
     def stretches(self) -> list[PiecePart]:
-        """The pieces of any kind. Raises `ConfigError` for a key of another kind, and without pieces; a default that is
-        stated is none.
-        """
-        own = {"circle": ("lap_s", "side"), "square": ("turn_every_s", "side"), "pieces": ("pieces",)}[self.kind]
-        for key in ("lap_s", "turn_every_s", "side", "pieces"):
-            if key not in own and getattr(self, key) != type(self).model_fields[key].default:
-                raise ConfigError(f"course.{key} is not of kind '{self.kind}'; leave it out")
+        """The pieces of any kind but `wander`. Raises `ConfigError` without pieces."""
         if self.kind == "circle":
             sign = -1.0 if self.side == "right" else 1.0
             return [PiecePart(for_s=self.lap_s, turn_radps=sign * 2.0 * math.pi / self.lap_s)]
@@ -57,23 +68,53 @@ class CoursePart(Part):
             raise ConfigError("course.pieces is missing; state at least one, for instance pieces = [{ for_s = 5.0 }]")
         return self.pieces
 
-    def check(self, model: str) -> None:
-        """Raises `ConfigError` if a target of `model` cannot follow it."""
-        self.stretches()
+    def box(self, start: Array, axes: int) -> tuple[Array, Array]:
+        """Lowest and highest corner (axes,) of where a target wanders from a `start` (axes or more,)."""
+        reach = np.array(self.reach_m[:axes])
+        low, high = start[:axes] - reach, start[:axes] + reach
+        if axes == 3:
+            low[2] = max(low[2], self.min_altitude_m)
+        return low, high
+
+    def check(self, model: str, start: list[float] | None = None) -> None:
+        """Raises `ConfigError` if a target of `model` cannot follow it from a `start`, or for a key of another kind; a
+        default that is stated is none.
+        """
+        for key, field in type(self).model_fields.items():
+            if key != "kind" and key not in KEYS[self.kind] and getattr(self, key) != field.default:
+                raise ConfigError(f"course.{key} is not of kind '{self.kind}'; leave it out")
         layout = LAYOUTS[model]
         if layout.heading is not None or layout.dim != 2 * len(layout.position):
             raise ConfigError(
                 f"course: the model '{model}' does not move by a velocity alone; take 'constant_velocity_3d' or "
                 "'constant_velocity'"
             )
+        if self.kind != "wander":
+            self.stretches()
+        elif min(self.reach_m) <= 0.0:
+            raise ConfigError("course.reach_m must be above 0 along each axis")
+        elif start is not None and len(start) == layout.dim:
+            axes = len(layout.position)
+            if any(start[axes:]):
+                raise ConfigError(f"course: who wanders starts at rest; end start.pose with {axes} zeros")
+            if axes == 3 and start[2] < self.min_altitude_m:
+                raise ConfigError(
+                    f"course.min_altitude_m = {self.min_altitude_m:g} is above the start at {start[2]:g} m; lower it"
+                )
 
 
-def followed(course: CoursePart, layout: StateLayout, start: Array, step_ns: int, steps: int) -> Array:
+def followed(
+    course: CoursePart, layout: StateLayout, start: Array, step_ns: int, steps: int, seed: int = 0, name: str = ""
+) -> Array:
     """True states (steps + 1, n) of position and velocity, in ENU [m, m/s], from a `start` (n,).
 
     A turn on the spot that is due at an instant is seen in the velocity of the next one: whoever turns every 5 s goes
-    straight for all of them.
+    straight for all of them. Who wanders does so by draws of `seed` that are named by `name`.
     """
+    if course.kind == "wander":
+        low, high = course.box(start, len(layout.position))
+        most = course.max_speed_mps, course.max_acceleration_mps2
+        return wandered(layout, start, low, high, *most, step_ns * 1e-9, steps, seed, name)
     turned = _turned(course.stretches(), step_ns, steps)
     axes = len(layout.position)
     cos, sin = np.cos(turned), np.sin(turned)

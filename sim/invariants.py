@@ -147,10 +147,10 @@ def _unlearnt(life: _Life, estimate: Estimate) -> Iterable[tuple[str, str]]:
     """Where nothing has been learnt the determinant of the pose covariance (x, y, heading) does not fall.
 
     That of the position alone may: what was unsure across the track can become what is unsure along it. A `replica`
-    makes its belief anew from all data, whenever any arrive.
+    makes its belief anew from all data, whenever any arrive, and who is `fixed` believes what it is told.
     """
     agent = life.node.agent
-    if agent.settings.localization.kind == "replica":
+    if agent.settings.localization.kind in ("replica", "fixed"):
         return
     learnt = sum(entry.count for entry in agent.nis.values())
     learnt += sum(count for name, count in agent.counters.items() if name.startswith(LEARNING))

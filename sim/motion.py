@@ -26,7 +26,7 @@ def driven(scenario: Scenario, mover: RobotPart | TargetPart, start: Array, seed
     if layout.heading is None:
         assert isinstance(mover, TargetPart)
         if mover.course is not None:
-            return followed(mover.course, layout, start, nanoseconds(scenario.step_s), steps)
+            return followed(mover.course, layout, start, nanoseconds(scenario.step_s), steps, seed, mover.id)
         return _drifted(scenario, mover, layout, start, seed, steps)
     dt = scenario.step_s
     noise = normal_rows(seed, steps, 2, mover.id, "control")

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.settings import NS
+from sim.formation_figures import trial_formation
 from sim.reach import Reach
 from sim.scenario import Scenario
 from sim.sight import steps_between
@@ -111,13 +112,15 @@ def trial_motion(scenario: Scenario, world: World, measured: Instants, played: i
         reach = Reach(world, links)
         heard = np.array([reach.heard(k) for k in range(played + 1)])
     figures = motion_figures(places, inside, world.step_ns / NS, scenario.collision_m, links.range_m, heard)
-    return figures | {"target_seen_share": seen_share(scenario, measured, inside)}
+    figures["target_seen_share"] = seen_share(scenario, measured, inside)
+    return figures | trial_formation(scenario, world, inside)
 
 
 def over_trials(trials: Sequence[dict[str, Any]]) -> dict[str, float | None]:
-    """Mean over trials of each figure, the smallest distance of all; None of what no trial has."""
+    """Mean over trials of each figure, the smallest distances of all; None of what no trial has."""
     found: dict[str, float | None] = {}
     for name in trials[0]:
         values = [trial[name] for trial in trials if trial[name] is not None]
-        found[name] = None if not values else min(values) if name == "min_distance_m" else float(np.mean(values))
+        least = name.endswith("min_distance_m")
+        found[name] = None if not values else min(values) if least else float(np.mean(values))
     return found

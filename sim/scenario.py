@@ -121,8 +121,9 @@ class SensorPart(Part):
     `max_range_m`, nearer than `min_range_m` or out of the field of view `fov_rad`, which is centred on the sensor's
     forward axis. Simulated ranges are too long by `bias_m`, or by what `bias_of` says of the subject. Directions
     (`bearing3`) err by `noise`, see `sim.directions`. Who could be seen is detected with the probability `detects`; the
-    share `false_share` of detections is of a direction drawn evenly. A recorded camera has the mount and intrinsics of
-    the recording.
+    share `false_share` of detections is of a direction drawn evenly. With a `gimbal` the field of view is a cone about
+    where the camera saw a target last, see `sim.gimbal`. A recorded camera has the mount and intrinsics of the
+    recording.
     """
 
     kind: SensorKind | None = None
@@ -140,6 +141,7 @@ class SensorPart(Part):
     max_range_m: Positive | None = None
     min_range_m: NotNegative = 0.0
     fov_rad: Positive | None = None
+    gimbal: bool = False
     rate_hz: Positive | None = None
     mount: MountVector = [0.0, 0.0, 0.0]
     intrinsics: IntrinsicsPart = IntrinsicsPart()
@@ -155,13 +157,24 @@ class VehiclePart(Part):
     `min_speed_mps` below 0: it drives backwards too; above 0: it cannot stand still. Without `max_acceleration_mps2`
     its speed changes at once. It `turns` along its way, on an arc, or after it: straight on, and then on the spot, as
     the discrete unicycle of publications does in each step.
+
+    One that `flies` goes in any direction, and stands still in the air: `max_speed_mps` is level, `max_climb_mps` up
+    and down (absent: as fast), and its velocity changes by `max_acceleration_mps2` whatever way.
     """
+
+    flies: bool = False
+    max_climb_mps: Positive | None = None
 
     max_speed_mps: Positive = PLAIN.max_speed_mps
     max_turn_radps: Positive = PLAIN.max_turn_radps
     max_acceleration_mps2: Positive | None = None
     min_speed_mps: Finite = 0.0
     turns: Literal["along", "after"] = "along"
+
+    @property
+    def climb_mps(self) -> float:
+        """How fast it climbs and sinks."""
+        return self.max_speed_mps if self.max_climb_mps is None else self.max_climb_mps
 
 
 class AutopilotPart(Part):

@@ -7,6 +7,7 @@ from agent.config_file import (
 )
 from agent.config_parts import MAX_TEAM
 from agent.estimation.motion import LAYOUTS
+from agent.estimation.mounting import mount_of
 from agent.estimation.observation import RELATIVE_ANGLES
 from agent.fault_parts import AnyFaultPart, SensorDelayPart, SensorFaultPart, check_faults, named
 from agent.joint_room import check_room
@@ -194,6 +195,11 @@ def _check_planning(scenario: Scenario) -> None:
                 planning = planning.model_copy(update={"radio_range_m": scenario.links.range_m})
                 source = "; planning.radio_range_m is not stated, which is links.range_m then"
             planning.settings()
+            planning.check_model(robot.model, [(target.id, target.model) for target in scenario.targets])
+            if planning.kind == "encircle" and not robot.vehicle.flies:
+                raise ConfigError(
+                    f"robots.{robot.id}: planning.kind = 'encircle' is of vehicles that fly; set vehicle.flies = true"
+                )
     except ConfigError as error:
         raise ConfigError(f"{scenario.name}: {error}{source}") from None
     for robot in scenario.robots:
@@ -202,6 +208,15 @@ def _check_planning(scenario: Scenario) -> None:
             raise ConfigError(
                 f"{where}.vehicle.min_speed_mps = {vehicle.min_speed_mps:g} is above max_speed_mps = "
                 f"{vehicle.max_speed_mps:g}; lower it"
+            )
+        if vehicle.flies and robot.model != "planar_altitude":
+            raise ConfigError(f"{where}.vehicle.flies needs model = 'planar_altitude', not '{robot.model}'; change one")
+        if vehicle.max_climb_mps is not None and not vehicle.flies:
+            raise ConfigError(f"{where}.vehicle.max_climb_mps is of a vehicle that flies; set vehicle.flies = true")
+        if vehicle.flies and (vehicle.min_speed_mps != 0.0 or vehicle.turns != "along"):
+            raise ConfigError(
+                f"{where}.vehicle: one that flies stands still in the air and turns as it likes; leave min_speed_mps "
+                "and turns out"
             )
     for robot in scenario.planners():
         where, kind = f"{scenario.name}: robots.{robot.id}", scenario.planning_of(robot).kind
@@ -245,16 +260,18 @@ def _check_course(where: str, target: TargetPart) -> None:
     if target.course is None:
         return
     try:
-        target.course.check(target.model)
+        target.course.check(target.model, target.start.pose)
     except ConfigError as error:
         raise ConfigError(f"{where}.{error}") from None
     if target.recorded:
         raise ConfigError(f"{where}.course does not go with a recording, where it went its way already; leave it out")
+    if target.course.kind == "wander" and target.start.spread:
+        raise ConfigError(f"{where}.start.spread does not go with a course of kind 'wander'; leave it out")
 
 
 def _check_recorded(where: str, sensor: SensorPart) -> None:
     """What a recorded sensor said is not made worse."""
-    for key in ("noise", "detects", "false_share"):
+    for key in ("noise", "detects", "false_share", "gimbal"):
         if getattr(sensor, key) != getattr(SensorPart(), key):
             raise ConfigError(f"{where}.{key} does not go with a recording, which is as it is; leave it out")
 
@@ -295,7 +312,13 @@ def check_sensor(where: str, name: str, sensor: SensorPart) -> None:
         raise ConfigError(f"{where}: sigma_px is missing")
     if kind in RELATIVE_ANGLES and not sensor.of:
         raise ConfigError(f'{where}: of is missing, for instance of = ["peers"]')
+    if sensor.gimbal and (sensor.fov_rad is None or sensor.of != ["targets"] or any(mount_of(sensor.mount)[3:])):
+        raise ConfigError(
+            f"{where}.gimbal is of a camera that turns to targets within its field of view; state fov_rad and "
+            'of = ["targets"], and no angles in mount'
+        )
     for key, kinds in (
+        ("gimbal", ("bearing3",)),
         ("noise", ("bearing3",)),
         ("detects", tuple(RELATIVE_ANGLES)),
         ("false_share", ("bearing", "bearing3")),

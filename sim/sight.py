@@ -54,11 +54,11 @@ class View(NamedTuple):
 
 
 def views(scenario: Scenario) -> dict[str, list[View]]:
-    """The fields of view of each robot's sensors, of robots that have any."""
+    """The fields of view of each robot's sensors, of robots that have any; not of those that turn."""
     found: dict[str, list[View]] = {}
     for robot in scenario.robots:
         for sensor in robot.sensors.values():
-            if sensor.fov_rad is not None:
+            if sensor.fov_rad is not None and not sensor.gimbal:
                 x, y, _, _, _, yaw = mount_of(sensor.mount)
                 view = View(x, y, yaw, sensor.fov_rad, sensor.min_range_m, sensor.max_range_m)
                 if view not in found.setdefault(robot.id, []):

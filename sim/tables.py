@@ -77,8 +77,14 @@ def motion(summary: dict[str, Any]) -> str:
     shares = [found["connected_share"], found["target_seen_share"]]
     row = [number(found["collisions"], 0 if summary["trials"] == 1 else 2), number(found["min_distance_m"], 2)]
     row += ["–" if share is None else f"{100.0 * share:.0f} %" for share in shares]
+    if found.get("formation_error") is not None:
+        header[4:4] = ["distance to the slot", "formation kept", "smallest distance to the target [m]"]
+        row += [f"{100.0 * found[key]:.0f} %" for key in ("formation_error", "formation_kept_share")]
+        row.append(number(found["target_min_distance_m"], 2))
     text = f"A collision: two robots come nearer than {found['collision_m']:g} m. Connected: all hear each other, "
     text += "if not directly then through others, as far as the radio reaches. Shares and speed are over the window."
+    if len(header) > 5:
+        text += " Distances to slots are shares of the formation's radius; it is kept while nobody is off by 25 %."
     return section("Motion", table(header, [[*row, number(found["speed_mps"], 2)]]), text)
 
 

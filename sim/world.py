@@ -8,7 +8,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.config_file import ConfigError
 from agent.effects import Steer
 from agent.estimation.gain_motion import reported
 from agent.estimation.gaussian import wrap, wrap_components
@@ -17,10 +16,12 @@ from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, OutOfVi
 from agent.estimation.odometry import OdometryNoise
 from agent.settings import NS, nanoseconds
 from agent.timeline import Phase
-from sim.closed_loop import ClosedLoop, Motion, increment, planar_of
-from sim.directions import DRAWS, anywhere, direction_covariance, disturbed
+from sim.closed_loop import ClosedLoop, Motion, planar_of
+from sim.directions import DRAWS, anywhere, direction_covariance, direction_of, disturbed, vector
+from sim.gimbal import Gimbal, level_turned
 from sim.motion import driven
 from sim.noise import generator, normal_rows, uniform_rows
+from sim.placement import draw_phases
 from sim.scenario import RobotPart, Scenario, SensorPart, TargetPart, sensor_kind
 from sim.sight import places, sights, steps_between
 from sim.steering import steered
@@ -96,7 +97,7 @@ def control_odometry(robot: RobotPart, step_s: float) -> OdometryNoise:
     """The odometry noise a robot's estimator assumes: stated, or that of its control noise."""
     if robot.odometry is not None:
         return robot.odometry.noise()
-    return robot.noise.odometry(step_s)
+    return robot.noise.odometry(step_s, robot.vehicle.flies)
 
 
 def order(output: Output) -> tuple[int, int, str, str]:
@@ -167,8 +168,8 @@ class SimulatedWorld:
         self.motion = Motion()
         for robot in scenario.planners():
             states = self.motion.states[robot.id] = self._tracks[robot.id]
-            states[1:, planar_of(robot)] = np.nan
-            self.motion.moved[robot.id] = np.full((self.steps, 3), np.nan)
+            states[1:, slice(None) if robot.vehicle.flies else planar_of(robot)] = np.nan
+            self.motion.moved[robot.id] = np.full((self.steps, 4), np.nan)
         self.closed_loop = bool(self.motion.states) and not played
         self._loop = ClosedLoop(scenario, self.motion, seed, self.step_ns) if self.closed_loop else None
         movers = scenario.movers()
@@ -185,6 +186,12 @@ class SimulatedWorld:
         }
         self._sensor_noise: dict[tuple[str, str, str], Array] = {}
         self._chances: dict[tuple[str, str, str], Array] = {}
+        self._gimbals = {
+            (robot.id, name): Gimbal(sensor.fov_rad or 2.0 * np.pi, self._heading(robot.id, 0))
+            for robot in scenario.robots
+            for name, sensor in robot.sensors.items()
+            if sensor.gimbal
+        }
 
     def truth(self, entity: str, k: int) -> Array:
         return np.asarray(self._tracks[entity][k])
@@ -233,7 +240,7 @@ class SimulatedWorld:
             speed, yaw_rate = self._commands[robot.id][k - 1]
         delta = dt * np.array([speed, 0.0, control.climb_mps, yaw_rate])
         if robot.id in self.motion.moved:
-            delta = increment(robot, self.motion.moved[robot.id][k - 1], dt)
+            delta = self.motion.moved[robot.id][k - 1].copy()
         noise = self._odometry_noise[robot.id]
         if LAYOUTS[robot.model] is UNICYCLE_GAINS:
             delta[[0, 1, 3]] = reported(self._tracks[robot.id][k - 1], delta[[0, 1, 3]])
@@ -268,6 +275,9 @@ class SimulatedWorld:
             return [Output(t_ns, Phase.PRIVATE, robot.id, name, kind, None, wrap_components(z, fix.angles), R)]
         outputs = []
         attitude = self._attitude(robot.id, k)
+        gimbal, place = self._gimbals.get((robot.id, name)), self._places[self._index[robot.id], k]
+        if gimbal is not None:
+            gimbal.turn(t_ns)
         for sight in self._sights[robot.id, name]:
             if gaps[sight.index] > sight.reach_m:
                 continue
@@ -276,7 +286,10 @@ class SimulatedWorld:
             distance = model.distance(joint)
             if distance < sensor.min_range_m or (sensor.max_range_m is not None and distance > sensor.max_range_m):
                 continue
-            if sensor.fov_rad is not None:
+            if gimbal is not None:
+                if not gimbal.sees(self._places[sight.index, k] - place):
+                    continue
+            elif sensor.fov_rad is not None:
                 (azimuth,) = replace(model, kind="bearing").h(joint)
                 if abs(azimuth) > 0.5 * sensor.fov_rad:
                     continue
@@ -296,7 +309,12 @@ class SimulatedWorld:
             else:
                 z = clean + np.sqrt(np.diagonal(R)) * draws
             if chance is not None and chance[1] < sensor.false_share:
-                z = anywhere(len(z), chance[2:], sensor.fov_rad)
+                if gimbal is None:
+                    z = anywhere(len(z), chance[2:], sensor.fov_rad)
+                else:
+                    z = direction_of(level_turned(-self._heading(robot.id, k), gimbal.anywhere(chance[2:])))
+            if gimbal is not None:
+                gimbal.saw(level_turned(self._heading(robot.id, k), vector(z)))
             if turned:
                 R = direction_covariance(sensor.noise, z, sensor.sigma_rad or 0.0)
             wrap_components(z, model.angles)
@@ -304,6 +322,11 @@ class SimulatedWorld:
                 z[0] = max(z[0] + sensor.bias_of.get(of, sensor.bias_m), 0.0)
             outputs.append(Output(t_ns, phase_of(of), robot.id, name, kind, of, z, R, attitude=attitude))
         return outputs
+
+    def _heading(self, robot: str, k: int) -> float:
+        heading = self._layouts[robot].heading
+        assert heading is not None
+        return float(self._tracks[robot][k, heading])
 
     def _attitude(self, robot: str, k: int) -> tuple[float, float] | None:
         """Roll and pitch [rad], within what is told of them; None: level."""
@@ -339,42 +362,3 @@ def start_pose(robot: RobotPart | TargetPart, phases: dict[str, float], seed: in
     y = circle.center_m[1] + circle.radius_m * np.sin(phase)
     altitude = [robot.control.altitude_m] if LAYOUTS[robot.model] is SPATIAL else []
     return np.array([x, y, *altitude, float(wrap(np.array(phase + np.pi / 2.0)))])
-
-
-def draw_phases(scenario: Scenario, seed: int) -> dict[str, float]:
-    """Phases of all robots on circles, redrawn until the contact graph over a lap is connected.
-
-    Raises `ConfigError` when no draw within `max_draws` passes.
-    """
-    circling = [robot for robot in scenario.robots if robot.start.circle is not None]
-    placement = scenario.world.placement
-    if not circling or placement is None:
-        return {}
-    rng = generator(seed, "world", "placement")
-    for _ in range(placement.max_draws):
-        phases = dict(zip((r.id for r in circling), rng.uniform(-np.pi, np.pi, len(circling)).tolist()))
-        if _connected(circling, phases, placement.contact_range_m, placement.reaches):
-            return phases
-    raise ConfigError(
-        f"{scenario.name}: no placement in {placement.max_draws} draws connects all robots with "
-        f"'{placement.reaches}'; enlarge world.placement.contact_range_m or move the circles"
-    )
-
-
-def _connected(robots: list[RobotPart], phases: dict[str, float], contact_range_m: float, root: str) -> bool:
-    turn = np.linspace(0.0, 2.0 * np.pi, 169)
-    paths = {}
-    for robot in robots:
-        circle = robot.start.circle
-        assert circle is not None
-        angle = phases[robot.id] + turn
-        paths[robot.id] = np.array(circle.center_m) + circle.radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    reached, frontier = [root], [root]
-    while frontier:
-        here = frontier.pop()
-        for other, path in paths.items():
-            gap = np.min(np.linalg.norm(paths[here] - path, axis=1))
-            if other not in reached and gap <= contact_range_m:
-                reached.append(other)
-                frontier.append(other)
-    return len(reached) == len(paths)

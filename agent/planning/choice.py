@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from agent.planning.encircle import Encircle
 from agent.planning.optimal import OptimalPlanner
 from agent.planning.potential import PotentialLaw, PotentialPlanner
 from agent.planning.random_walk import RandomWalk
@@ -18,6 +19,14 @@ def build_planner(settings: PlanningSettings, robot: str) -> Planner | None:
         return None
     if settings.kind == "random":
         return RandomWalk(robot, settings.seed, settings.max_speed_mps, settings.max_turn_radps)
+    if settings.kind == "encircle":
+        return Encircle(
+            radius_m=settings.radius_m,
+            closest_m=settings.closest_m,
+            max_speed_mps=settings.max_speed_mps,
+            max_climb_mps=settings.max_climb_mps,
+            max_turn_radps=settings.max_turn_radps,
+        )
     law = PotentialLaw(
         closest_m=settings.closest_m,
         apart_m=settings.apart_m,

@@ -1,4 +1,7 @@
-"""What a planner is told, and what it answers. Planners see beliefs, never truth; everything lies in the plane."""
+"""What a planner is told, and what it answers. Planners see beliefs, never truth.
+
+Robots on the ground lie in the plane; of who flies the altitude is known too.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,8 @@ class TargetView:
 class Member:
     """A robot of the team: pose (3,) x, y, heading with cov (3, 3), last known command, what it believes of targets.
 
-    `age_s`: how old all of this is. The own one is of the present.
+    `age_s`: how old all of this is. The own one is of the present. `altitude_m` is 0 of who lies in the plane.
+    `silent`: it was heard there last, and is no longer counted on.
     """
 
     robot: str
@@ -37,6 +41,13 @@ class Member:
     yaw_rate_radps: float
     targets: tuple[TargetView, ...] = ()
     age_s: float = 0.0
+    altitude_m: float = 0.0
+    silent: bool = False
+
+    @property
+    def place(self) -> Array:
+        """x, y, z (3,) [m]."""
+        return np.array([self.pose[0], self.pose[1], self.altitude_m])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,10 +62,12 @@ class Situation:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Forward speed and yaw rate, held until the next choice."""
+    """Forward speed and yaw rate, held until the next choice; of who flies also the speeds to the left and up."""
 
     speed_mps: float
     yaw_rate_radps: float
+    left_mps: float = 0.0
+    up_mps: float = 0.0
 
 
 class Planner(Protocol):

@@ -55,7 +55,7 @@ def usable(situation: Situation) -> Situation:
 
 
 def _is_usable(member: Member) -> bool:
-    told = (member.speed_mps, member.yaw_rate_radps, member.age_s)
+    told = (member.speed_mps, member.yaw_rate_radps, member.age_s, member.altitude_m)
     return _is_belief(member.pose, member.cov, 3) and all(abs(number) <= FARTHEST for number in told)
 
 

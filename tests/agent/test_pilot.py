@@ -122,6 +122,30 @@ def test_a_robot_that_was_held_up_plans_once_and_for_the_present() -> None:
     assert agent.counters["round.skipped"] == agent.counters["plan.skipped"] == 7
 
 
+def test_a_plan_is_made_though_the_next_round_begins_while_neighbours_are_waited_for() -> None:
+    """Of quick rounds over slow links what neighbours told after their corrections may always come too late."""
+    agent = Agent(planning(round=replace(ROUND, wait_ns=55 * NS // 100)))
+    made(agent, LinkChange(0, "r2", True, 1, 1))
+    for k in range(4):
+        made(agent, *([drive(k, 0.1)] if k else []), heard(report(RoundStage.PRIOR, (-8.0, 0.0)), k * NS, seq=k))
+        agent.handle(Tick(k * NS))
+    assert agent.counters["plan.made"] == 3
+    assert agent.counters["plan.skipped"] == 0
+
+
+def test_who_flies_keeps_off_the_place_where_another_one_fell_silent() -> None:
+    """It may hover there: for a minute, then it is forgotten."""
+    agent = Agent(replace(planning(), planning=PlanningSettings(kind="encircle", closest_m=6.0)))
+    made(agent, LinkChange(0, "r2", True, 1, 1), Tick(0), heard(report(RoundStage.POSTERIOR, (3.0, 0.0)), 0))
+    speeds = {}
+    for k in (20, 59, 62):
+        made(agent, *(drive(j, 0.0) for j in range(max(speeds, default=0) + 1, k + 1)))
+        found = made(agent, Tick(k * NS), Tick(k * NS + WAIT), Tick(k * NS + 2 * WAIT))
+        speeds[k] = steers(found)[-1].velocity_mps[0]
+    assert speeds[20] < -0.1 and speeds[59] < -0.1
+    assert speeds[62] == 0.0
+
+
 def test_a_report_from_the_future_is_not_waited_by() -> None:
     agent = Agent(planning())
     far = Message(Header("r2", 1, 1, 0, 100 * NS, 0), report(RoundStage.POSTERIOR, (3.0, 0.0)))

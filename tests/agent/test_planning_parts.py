@@ -28,6 +28,8 @@ def test_what_is_stated_counts() -> None:
         "form": "published",
         "max_speed_mps": 0.7,
         "max_turn_radps": 0.4,
+        "max_climb_mps": 0.2,
+        "radius_m": 12.0,
         "speed_share": 0.0,
         "heading_rad_per_m": 0.5,
         "closest_m": 5.0,
@@ -54,6 +56,10 @@ def test_what_is_stated_counts() -> None:
     ("part", "words"),
     [
         (RoundPart(period_s=1.0, wait_s=1.0), r"round\.wait_s = 1 is not below round\.period_s = 1.*shorten"),
+        (
+            PlanningPart(kind="encircle", closest_m=6.0, radius_m=5.0),
+            r"closest_m = 6 is not below planning\.radius_m = 5.*or planning\.radius_m larger",
+        ),
         (
             PlanningPart(kind="potential", closest_m=12.0),
             r"closest_m = 12 is not below planning\.apart_m = 10; make it smaller, or planning\.apart_m larger",
@@ -121,3 +127,20 @@ def test_trackers_know_of_a_target_s_noise_by_its_speed() -> None:
     noise = ControlNoisePart(speed_share=0.02, yaw_rate_per_mps=0.08)
     motion = target_motion("unicycle", ControlPart(speed_mps=0.25), noise, 1.0, 2.0)
     assert motion.noise_sigma == pytest.approx((0.005, 0.02))
+
+
+@pytest.mark.parametrize(
+    ("model", "targets", "words"),
+    [
+        ("unicycle", [("t1", "constant_velocity_3d")], "take 'planar_altitude'"),
+        ("planar_altitude", [], "give one of .*'constant_velocity_3d'"),
+        ("planar_altitude", [("t1", "unicycle")], "moves by a velocity"),
+    ],
+)
+def test_who_cannot_fly_or_has_nobody_to_follow_does_not_encircle(
+    model: str, targets: list[tuple[str, str]], words: str
+) -> None:
+    with pytest.raises(ConfigError, match=words):
+        PlanningPart(kind="encircle").check_model(model, targets)
+    PlanningPart(kind="potential").check_model(model, targets)
+    PlanningPart(kind="encircle").check_model("planar_altitude", [*targets, ("t2", "constant_velocity_3d")])

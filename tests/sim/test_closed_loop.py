@@ -219,6 +219,31 @@ def test_gains_and_altitudes_go_with_it() -> None:
     assert np.isfinite(air.place("r1", 60)).all()
 
 
+def test_who_flies_goes_up_and_to_the_side_and_its_odometry_states_all_of_its_noise() -> None:
+    total, count, noise = 0.0, 0, {"speed_mps": 0.1, "climb_mps": 0.05, "yaw_rate_radps": 0.02}
+    for seed in range(10):
+        made = scenario(
+            noise,
+            model="planar_altitude",
+            vehicle={"flies": True, "max_speed_mps": 2.0, "max_acceleration_mps2": 1.0},
+            start={"pose": [0.0, 0.0, 5.0, 0.4]},
+            start_sigma={"position_m": 0.5, "altitude_m": 0.1, "heading_rad": 0.1},
+        )
+        world = SimulatedWorld(made, seed)
+        for k in range(1, 61):
+            world.steer("r1", (k - 1) * NS, Steer((0.3, -0.8, 0.2), 0.1 * np.sin(k), k * NS))
+            (item,) = odometry(world.outputs(k), "r1")
+            before, after = world.truth("r1", k - 1), world.truth("r1", k)
+            error = np.zeros(4)
+            error[[0, 1, 3]] = between(before[[0, 1, 3]], after[[0, 1, 3]]) - item.z[[0, 1, 3]]
+            error[2] = after[2] - before[2] - item.z[2]
+            total += float(np.sum(error**2 / np.diagonal(item.R)))
+            count += 4
+        assert world.place("r1", 60)[2] == pytest.approx(5.0 + 0.2 * 59.5, abs=2.0)
+        assert item.z[1] < -0.5
+    assert is_chi_square(total, count)
+
+
 GAINS = {"position_m": 0.5, "heading_rad": 0.1, "gain_along": 0.05, "gain_turn": 0.05}
 
 

@@ -20,6 +20,7 @@ from sim.animation import unpack
 from sim.metrics import StateTrace, TrialTrace, summarize
 from sim.report import ReportUnavailable, write_report
 from sim.store import Instants, Stored
+from sim.tables import motion
 
 Array = NDArray[np.float64]
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -377,6 +378,14 @@ def test_motion_is_told_and_distances_are_drawn(tmp_path: Path) -> None:
     assert ["3", "0.87", "75 %", "31 %", "0.42"] in page.rows
     assert "nearer than 1.5 m" in page.text
     assert page.pictures["How far robots were from each other"].startswith(PNG)
+
+
+def test_a_formation_is_told_where_there_is_one() -> None:
+    formation = {"formation_error": 0.046, "formation_kept_share": 0.984, "target_min_distance_m": 10.59}
+    for found, told in ((MOTION | formation, True), (MOTION, False)):
+        text = motion({"motion": found, "trials": 1})
+        assert ("formation kept" in text) is told
+        assert all((value in text) is told for value in (">5 %<", ">98 %<", ">10.59<"))
 
 
 def test_motion_nobody_knows_is_left_out(tmp_path: Path) -> None:

@@ -13,10 +13,11 @@ from agent.config_file import ConfigError
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import LAYOUTS, between, velocity_step
 from agent.timeline import Phase
+from sim.placement import draw_phases
 from sim.scenario import Scenario
 from sim.scenario_checks import check
 from sim.scenario_file import load
-from sim.world import Output, SimulatedWorld, control_odometry, draw_phases, order
+from sim.world import Output, SimulatedWorld, control_odometry, order
 
 Array = NDArray[np.float64]
 RANGE = {"of": ["peers"], "sigma_m": 0.1}
