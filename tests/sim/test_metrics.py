@@ -360,8 +360,7 @@ def test_velocities_of_targets_have_figures() -> None:
     # A target with a heading has none.
     made.targets["t1"] = {name: made.robots[name] for name in made.robots}
     row = trial_figures(reduce_trial(made, WINDOW))
-    assert row["target_velocity_rmse_mps"] is None
-    assert "t1_velocity_rmse_mps" not in row
+    assert not {"target_velocity_rmse_mps", "t1_velocity_rmse_mps"} & row.keys()
 
 
 def test_nothing_can_be_said_of_no_trials() -> None:

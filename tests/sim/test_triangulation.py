@@ -17,7 +17,7 @@ from tests.sizes import sized
 
 KINDS = ("stt", "cmkf", "cikf", "hcmci", "tkf", "kcf_plus", "icf_plus")
 IMPROVED = KINDS[-2:]
-SECONDS = 8.0
+SECONDS = 6.0
 SEEDS = range(1, sized(2, 20) + 1)
 
 
@@ -37,13 +37,14 @@ def errors(result: TrialResult) -> np.ndarray:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_target_is_followed_by_cameras_that_tell_each_other_bearings(kind: str) -> None:
     overrides = () if kind in IMPROVED else ("tracking.parallax_rad=0",)
-    result = run_trial(cameras(kind, *overrides), 1, checker=InvariantChecker(1))
+    seconds = 4.5
+    result = run_trial(cameras(kind, *overrides, seconds=seconds), 1, checker=InvariantChecker(1))
     found = errors(result)
     assert np.isfinite(found).all(), "every camera of the fixed layout sees bearings cross"
     rmse = float(np.sqrt(np.mean(found**2)))
     assert rmse < (1.5 if kind in IMPROVED else 4.5), (kind, rmse)
     for counters in result.counters.values():
-        assert counters["round.closed"] >= 10 * SECONDS - 1
+        assert counters["round.closed"] >= 10 * seconds - 1
         assert not counters.get("update.failed")
 
 
@@ -90,7 +91,7 @@ def test_a_camera_that_begins_again_tracks_again() -> None:
     result = run_trial(cameras("icf_plus", crash), 2, checker=InvariantChecker(2))
     trace = result.trace.targets["t1"]["c1"]
     off = np.linalg.norm((trace.mean - trace.truth)[:, :3], axis=-1)
-    assert off[result.trace.t_s >= 7.0].max() < 3.0
+    assert off[result.trace.t_s >= 5.5].max() < 3.0
 
 
 def test_the_bound_hears_every_bearing() -> None:
