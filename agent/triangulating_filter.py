@@ -129,7 +129,10 @@ class TriangulatingFilter:
         if self.t_ns >= due_ns - self._settings.lateness.tolerance_ns:
             self._clock.open(due_ns)
             self._open_ns = due_ns
-            effects.append(Broadcast(Channel.BELIEF, due_ns, self._triangulator.report(due_ns)))
+            then = self._belief(due_ns)
+            if then is not None:
+                report = self._triangulator.report(due_ns, self._place(then))
+                effects.append(Broadcast(Channel.BELIEF, due_ns, report))
 
     def expire(self, now_ns: int, effects: list[Effect]) -> None:
         self._own.expire(now_ns, effects)
@@ -138,13 +141,16 @@ class TriangulatingFilter:
             self._open_ns = None
             self._close(t_ns)
 
+    def _place(self, own: Moment) -> Array:
+        """Where the robot is, (3,)."""
+        place, sitting = np.zeros(3), self._settings.layout.position
+        place[: len(sitting)] = own.mean[list(sitting)]
+        return place
+
     def _close(self, t_ns: int) -> None:
         then = self._belief(t_ns)
         if then is not None:
-            place = np.zeros(3)
-            sitting = self._settings.layout.position
-            place[: len(sitting)] = then.mean[list(sitting)]
-            self._triangulator.step(t_ns, place, self._reports.newest(t_ns))
+            self._triangulator.step(t_ns, self._place(then), self._reports.newest(t_ns))
         self._closed_ns = t_ns
         self._revision = object()
 

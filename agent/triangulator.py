@@ -95,11 +95,13 @@ class Triangulator:
                 return
         self._seen[target] = t_ns, found
 
-    def report(self, t_ns: int) -> BearingReport:
-        """What neighbours are told at the round of `t_ns`, not earlier than the last one."""
+    def report(self, t_ns: int, place: Array) -> BearingReport:
+        """What neighbours are told at the round of `t_ns`, not before the last one, by a robot at `place` (3,)."""
         bearings, predictions = [], []
         for target in sorted(self._targets):
             kind, seen, track = self._filters[target], self._seen.get(target), self._tracks.get(target)
+            if track is None and seen is not None and seen[0] <= t_ns:
+                track = self._begin(target, t_ns, place)
             if seen is not None and kind.tells_sights and seen[0] <= t_ns:
                 at_ns, it = seen
                 bearings.append(Bearing(target, it.place, it.place_cov, it.direction, it.sigma_rad, t_ns - at_ns))
@@ -136,8 +138,7 @@ class Triangulator:
         if track is None:
             if not sights and not told:
                 return
-            track = self._tracks[target] = self._begun(target, t_ns, place)
-            self._counters["track.started"] += 1
+            track = self._begin(target, t_ns, place)
         if sights:
             track.learnt_ns = t_ns - round(min(float(item.age_s) for item in sights) * 1e9)
         state = self._filters[target].step(track.state, (t_ns - track.t_ns) * 1e-9, sights, told)
@@ -149,6 +150,11 @@ class Triangulator:
         self._counters["round.used_bearings"] += len(sights)
         if self._crossing(sights):
             track.crossed_ns = t_ns
+
+    def _begin(self, target: str, t_ns: int, place: Array) -> _Track:
+        track = self._tracks[target] = self._begun(target, t_ns, place)
+        self._counters["track.started"] += 1
+        return track
 
     def _begun(self, target: str, t_ns: int, place: Array) -> _Track:
         """The track before the round at `t_ns`: of a prior, if there is one, or, as published, at the own place."""
