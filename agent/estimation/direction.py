@@ -20,6 +20,10 @@ DIRECTED = ("bearing", "bearing3", "pixel")
 """Kinds of measurement that tell a direction and no distance."""
 
 
+WIDEST_RAD, FINEST_RAD = 0.5, 1e-5
+"""A direction less sure than that is none, for its cone is no plane across it; nobody knows one better than this."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Directed:
     """A unit vector `direction` (3,) from `place` (3,) [m], ENU.
@@ -36,7 +40,7 @@ class Directed:
 def directed(model: RelativeModel, mean: Array, cov: Array, z: Array, R: Array) -> Directed | None:
     """Where and in which direction a robot of belief (n,), (n, n) has measured z (m,), R (m, m).
 
-    None for kinds that are none of `DIRECTED`, or a robot without a heading.
+    None for kinds that are none of `DIRECTED`, or a robot without a heading, or one that hardly knows it.
     """
     observer = model.observer
     if model.kind not in DIRECTED or observer.heading is None:
@@ -58,7 +62,9 @@ def directed(model: RelativeModel, mean: Array, cov: Array, z: Array, R: Array) 
     moved[:, observer.heading] += np.cross(axis, lever)
     place[: len(sitting)] = mean[sitting]
     place_cov = moved @ cov @ moved.T
-    sigma = math.sqrt(max(float(np.linalg.eigvalsh(spread)[-1]), 0.0))
+    sigma = math.sqrt(max(float(np.linalg.eigvalsh(spread)[-1]), (2.0 * FINEST_RAD) ** 2))
+    if not sigma <= WIDEST_RAD:
+        return None
     return Directed(place + lever, 0.5 * (place_cov + place_cov.T), direction, sigma)
 
 

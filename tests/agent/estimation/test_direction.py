@@ -11,6 +11,7 @@ from agent.estimation.direction import directed
 from agent.estimation.motion import CONSTANT_VELOCITY_3D, SPATIAL, UNICYCLE
 from agent.estimation.observation import RelativeModel
 from network.messages import Mount
+from network.wire_fields import SENSOR_FLOOR
 
 ANGLE = st.floats(-3.1, 3.1)
 TILT = st.floats(-0.4, 0.4)
@@ -72,3 +73,16 @@ def test_a_planar_robot_sees_along_its_plane() -> None:
 def test_a_range_tells_no_direction() -> None:
     model = RelativeModel("range", UNICYCLE, subject=CONSTANT_VELOCITY_3D)
     assert directed(model, np.zeros(3), np.eye(3), np.array([2.0]), np.eye(1)) is None
+
+
+@pytest.mark.parametrize("heading_sigma", [0.6, 4.0, 1e3])
+def test_who_hardly_knows_its_heading_tells_no_direction(heading_sigma: float) -> None:
+    model = RelativeModel("bearing3", SPATIAL, subject=CONSTANT_VELOCITY_3D)
+    cov = np.diag([0.01, 0.01, 0.01, heading_sigma**2])
+    assert directed(model, np.zeros(4), cov, np.array([0.3, 0.1]), 1e-4 * np.eye(2)) is None
+
+
+def test_no_direction_is_told_that_others_would_refuse_as_too_sure() -> None:
+    model = RelativeModel("bearing3", SPATIAL, subject=CONSTANT_VELOCITY_3D)
+    found = directed(model, np.zeros(4), np.zeros((4, 4)), np.array([0.3, 0.1]), 1e-14 * np.eye(2))
+    assert found is not None and found.sigma_rad**2 > SENSOR_FLOOR
