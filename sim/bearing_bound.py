@@ -25,7 +25,7 @@ from agent.settings import AgentSettings, CoastSettings, LocalizationSettings, n
 from agent.timeline import OdometryTrack
 from agent.triangulator import PRECISE, density
 from sim.bound import BoundRunner
-from sim.scenario import Scenario, sensor_config
+from sim.scenario import Scenario
 from sim.world import Output, World
 
 Array = NDArray[np.float64]
@@ -44,11 +44,6 @@ class BearingBound(BoundRunner):
         }
         kind = scenario.tracking.kind
         self._models = {robot.id: LAYOUTS[robot.model] for robot in scenario.robots}
-        self._eyes = {
-            (robot.id, name): sensor_config(sensor)
-            for robot in scenario.robots
-            for name, sensor in world.sensors(robot.id).items()
-        }
         self._period_ns = nanoseconds(scenario.round.period_s)
         self._targets = {}
         for target in scenario.targets:
@@ -59,7 +54,8 @@ class BearingBound(BoundRunner):
 
     def step(self, k: int, outputs: list[Output]) -> None:
         """Use all data of step `k`."""
-        super().step(k, [item for item in outputs if item.of is None or not item.of.startswith("target:")])
+        if len(self._trusting) < len(self._models):
+            super().step(k, [item for item in outputs if item.of is None or not item.of.startswith("target:")])
         for trusting in self._trusting.values():
             trusting.step(k * self._step_ns, outputs)
         for item in outputs:
@@ -70,7 +66,7 @@ class BearingBound(BoundRunner):
 
     def _saw(self, item: Output) -> None:
         assert item.of is not None
-        target, sensor = self._targets[item.of.removeprefix("target:")], self._eyes[item.robot, item.sensor]
+        target, sensor = self._targets[item.of.removeprefix("target:")], self._sensors[item.robot, item.sensor]
         kind, z, R = sensor.reading(item.kind, item.of, item.z, item.R)
         observer = self._models[item.robot]
         model = RelativeModel(kind, observer, sensor.mount, None, target.layout, item.attitude or LEVEL)
