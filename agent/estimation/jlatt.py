@@ -37,6 +37,7 @@ PLACING = ("range_bearing", "vector")
 GRID = np.linspace(0.04, 0.96, 12)
 """Candidate weights of a split intersection; the trace is within a few percent of that of a finer grid."""
 GRID.flags.writeable = False
+BY_OWN, BY_OTHER = 1.0 / GRID, 1.0 / (1.0 - GRID)
 
 RING_RAD = 0.2
 """Deviation of a heading from which on the places where something may be seen are a ring, not a line across."""
@@ -249,7 +250,7 @@ def _split_step(cov: Array, H: Array, noise: Array, other: Array) -> tuple[Array
     """
     cross = cov @ H.swapaxes(-1, -2)
     alone = np.asarray(~other.any(axis=(-2, -1)))[..., None]
-    by_own, by_other = np.where(alone, 1.0, 1.0 / GRID), np.where(alone, 1.0, 1.0 / (1.0 - GRID))
+    by_own, by_other = np.where(alone, 1.0, BY_OWN), np.where(alone, 1.0, BY_OTHER)
     S = by_own[..., None, None] * (H @ cross)[..., None, :, :] + noise[..., None, :, :]
     S += by_other[..., None, None] * other[..., None, :, :]
     S_inverse = _inverse(S)
@@ -257,11 +258,12 @@ def _split_step(cov: Array, H: Array, noise: Array, other: Array) -> tuple[Array
     square = cross.swapaxes(-1, -2) @ cross
     before = np.trace(cov, axis1=-2, axis2=-1)
     traces = by_own * before[..., None] - by_own**2 * np.sum(S_inverse * square[..., None, :, :], axis=(-2, -1))
-    best = np.argmin(traces, axis=-1)[..., None]
-    w = np.take_along_axis(by_own, best, axis=-1)[..., None]
-    K = w * cross @ np.take_along_axis(S_inverse, best[..., None, None], axis=-3)[..., 0, :, :]
+    best = np.argmin(traces, axis=-1)
+    w = np.where(alone[..., 0], 1.0, BY_OWN[best])[..., None, None]
+    chosen = np.arange(best.size) * len(GRID) + best.ravel()
+    K = w * cross @ S_inverse.reshape(-1, *S.shape[-2:])[chosen].reshape(*best.shape, *S.shape[-2:])
     after = symmetrize(w * (cov - K @ cross.swapaxes(-1, -2)))
-    used = (np.take_along_axis(traces, best, axis=-1) < before[..., None])[..., None]
+    used = (traces.min(axis=-1) < before)[..., None, None]
     return np.where(used, after, cov), np.where(used, K, 0.0)
 
 

@@ -93,25 +93,24 @@ def _least_where_used(root: Array, whitened: Array, used: Mask, rule: Rule) -> A
 
 def _least(root: Array, whitened: Array, used: Mask, rule: Rule) -> Array:
     """Weights (..., 1 + m) of the least trace or determinant."""
-    lead = whitened.shape[:-3]
-    m, n = whitened.shape[-3], whitened.shape[-1]
-    flat = whitened.reshape(*lead, m, n * n)
+    lead, (m, n) = whitened.shape[:-3], whitened.shape[-3:-1]
     metric = root.swapaxes(-1, -2) @ root
-    weights = np.ones((*lead, m + 1))
-    weights[..., 1:] = used
+    # The prior is the identity, one of the informations: two products with all of them do for sums and slopes.
+    flat = np.empty((*lead, m + 1, n * n))
+    flat[..., 0, :] = np.eye(n).ravel()
+    flat[..., 1:, :] = whitened.reshape(*lead, m, n * n)
+    weights = np.ones((*lead, 1, m + 1))
+    weights[..., 0, 1:] = used
     weights /= weights.sum(axis=-1, keepdims=True)
-    slope = np.empty_like(weights)
     for _ in range(ITERATIONS):
-        inverse = np.asarray(np.linalg.inv(_sum(weights, whitened)))
+        inverse = np.asarray(np.linalg.inv((weights @ flat).reshape(*lead, n, n)))
         if rule == "trace":
             inverse = inverse @ metric @ inverse
-        slope[..., 0] = _trace(inverse)
-        slope[..., 1:] = (flat @ inverse.reshape(*lead, n * n, 1))[..., 0]
         # A prior without any error has no slope at all.
-        np.maximum(slope, LEAST, out=slope)
+        slope = np.maximum(inverse.reshape(*lead, 1, n * n) @ flat.swapaxes(-1, -2), LEAST)
         weights = weights * (np.sqrt(slope) if rule == "trace" else slope)
         weights /= weights.sum(axis=-1, keepdims=True)
-    return weights
+    return np.asarray(weights[..., 0, :])
 
 
 def _by_size(prior: Array, informations: Array, used: Mask, rule: Rule, staged: bool) -> Array:
