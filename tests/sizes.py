@@ -8,11 +8,12 @@ from itertools import islice
 from typing import TypeVar
 
 Item = TypeVar("Item")
+Number = TypeVar("Number", int, float)
 
 THOROUGH = bool(os.environ.get("COFIX_THOROUGH"))
 
 
-def sized(usual: int, thorough: int) -> int:
+def sized(usual: Number, thorough: Number) -> Number:
     return thorough if THOROUGH else usual
 
 

@@ -76,7 +76,7 @@ id = "A3"
 position = [0.0, 15.0]
 """
 
-TRIALS, SEED = sized(6, 12), 30
+TRIALS, SEED = sized(4, 12), 30
 
 
 @pytest.mark.parametrize(("model", "acceleration"), [("damped_velocity", "0.1"), ("constant_velocity", "0.01")])

@@ -18,7 +18,7 @@ from sim.scenario_file import load
 from sim.trial import run_trial
 from tests.sizes import sized
 
-SEEDS = range(1, sized(8, 24) + 1)
+SEEDS = range(1, sized(6, 24) + 1)
 FEW_SEEDS = range(1, sized(4, 8) + 1)
 WINDOW = (100.0, 300.0)
 NEVER_ABOVE = 1.7

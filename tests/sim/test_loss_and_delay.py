@@ -13,7 +13,7 @@ from sim.trial import run_trial
 from tests.sizes import sized
 
 SEEDS = range(1, sized(3, 12) + 1)
-WINDOW = (100.0, 400.0)
+WINDOW = (100.0, sized(300.0, 400.0))
 ROBOTS = ("r2", "r3", "r4")
 """Robot 1 has fixes."""
 

@@ -20,7 +20,7 @@ from tests.sizes import sized
 
 Array = NDArray[np.float64]
 
-SEEDS = range(1, sized(6, 24) + 1)
+SEEDS = range(1, sized(4, 24) + 1)
 POLAR = {"kind": "range_bearing", "sigma_m": 0.2, "sigma_rad": 0.03}
 FORMS = ("split_joint", "safe")
 

@@ -12,6 +12,7 @@ from agent.estimation.bearing_filters import FILTERS, Kind, acceleration_noise, 
 from agent.estimation.sights import Sight, Told
 from agent.estimation.triangulation import TrackState, transition
 from tests.agent.estimation.triangulation_world import DT, MODERATE, Faults, Run, play, world
+from tests.sizes import sized
 
 Array = NDArray[np.float64]
 
@@ -126,10 +127,10 @@ def both(kind: Kind, faults: Faults, seed: int, trials: int) -> list[Run]:
 
 @pytest.mark.parametrize(("kind", "least_m"), [("kcf_plus", 1.15), ("icf_plus", 1.0)])
 def test_random_layouts_are_tracked_better_than_published(kind: Kind, least_m: float) -> None:
-    """Within a tenth, for 25 trials; the published filter is at 2 to 2.8 m."""
+    """Within a tenth, for 25 trials, and a fifth for ten; the published filter is at 2 to 2.8 m."""
     seed = 41
-    for run in both(kind, Faults(), seed, 25):
-        assert run.position(run.tail) < 1.1 * least_m, f"seed {seed}"
+    for run in both(kind, Faults(), seed, sized(10, 25)):
+        assert run.position(run.tail) < sized(1.2, 1.1) * least_m, f"seed {seed}"
         assert run.anees() < 1.15, f"seed {seed}"
 
 
@@ -148,7 +149,7 @@ def test_random_layouts_are_tracked_better_than_published(kind: Kind, least_m: f
 )
 def test_faults_do_not_make_it_overconfident(kind: Kind, faults: Faults) -> None:
     seed = 42
-    for run in both(kind, faults, seed, 10):
+    for run in both(kind, faults, seed, sized(5, 10)):
         assert run.anees(run.tail) < 1.15, f"seed {seed}"
         if faults == MODERATE:
             assert run.position(run.tail) < 1.1 * 1.7, f"seed {seed}"
