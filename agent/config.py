@@ -281,6 +281,7 @@ def load_agent_config(path: Path) -> AgentConfig:
         raise ConfigError(f"{path}: initial.{error}") from None
     try:
         config.localization.settings()
+        config.lateness.check(config.localization, config.motion.model)
         config.tracking.check_kind(config.localization, [t.id for t in config.targets if t.mean is None])
         config.tracking.check_targets([(target.id, target.model) for target in config.targets])
         if config.localization.form == "joint":

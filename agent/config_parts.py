@@ -22,6 +22,7 @@ from agent.estimation.observation import Intrinsics
 from agent.settings import (
     CoastSettings,
     HealthSettings,
+    LatenessKind,
     LatenessSettings,
     LocalizationSettings,
     RoundWeights,
@@ -40,7 +41,7 @@ PROTECTED = UnsafeSettings()
 
 
 class LocalizationPart(Part):
-    kind: Literal["clat", "replica", "jlatt", "fixed"] = "clat"
+    kind: Literal["clat", "replica", "jlatt", "leader", "fixed"] = "clat"
     form: Literal["auto", "split_joint", "safe", "published", "joint"] = "auto"
     transform: Literal["unscented", "linearized", "jacobian"] | None = None
     correlation: Literal["factors", "ignored"] = "factors"
@@ -48,6 +49,11 @@ class LocalizationPart(Part):
     pair_interval_s: NotNegative | None = None
     pair_timeout_s: Positive = 2.0
     innovation_cap: NotNegative | None = None
+    leader: Id | None = None
+    exchange: Literal["broadcast", "request"] = "broadcast"
+    fixes: Literal["fused", "trusted"] = "fused"
+    leader_correlation_s: NotNegative = 0.0
+    clock_state: bool = False
 
     def settings(self) -> LocalizationSettings:
         """`safe` uses a contact of a pair every 3 s and trace weights; `published` every one and log det.
@@ -59,11 +65,18 @@ class LocalizationPart(Part):
         """
         if self.kind != "jlatt":
             self._refuse("weights", "jlatt", f"kind '{self.kind}' has no rounds")
+        if self.kind != "leader":
+            for key in ("leader", "exchange", "fixes", "leader_correlation_s", "clock_state"):
+                self._refuse(key, "leader", f"kind '{self.kind}' follows nobody")
+        elif self.leader is None:
+            raise ConfigError("leader is missing: kind = 'leader' needs the id of who leads, for instance leader = 'r1'")
         if self.kind == "fixed":
             self._refuse("innovation_cap", "clat", "kind 'fixed' has no innovations")
         if self.kind != "clat":
             for key in ("form", "correlation", "pair_interval_s"):
                 self._refuse(key, "clat", f"kind '{self.kind}' has no contacts of pairs")
+            if self.kind == "leader":
+                return self._following()
             return LocalizationSettings(
                 kind=self.kind,
                 transform=self.transform or ("jacobian" if self.kind == "jlatt" else "unscented"),
@@ -89,6 +102,20 @@ class LocalizationPart(Part):
             innovation_cap=cap,
         )
 
+    def _following(self) -> LocalizationSettings:
+        """Of the kind `leader`, which is an EKF as published."""
+        return LocalizationSettings(
+            kind="leader",
+            leader=self.leader or "",
+            exchange=self.exchange,
+            fixes=self.fixes,
+            leader_correlation_ns=nanoseconds(self.leader_correlation_s),
+            clock_state=self.clock_state,
+            transform=self.transform or "jacobian",
+            innovation_cap=self.innovation_cap or 0.0,
+            pair_timeout_ns=nanoseconds(self.pair_timeout_s),
+        )
+
     def rigid(self) -> str | None:
         """What makes robots begin together, with tracks that last; None: nothing."""
         if self.kind == "replica":
@@ -103,8 +130,23 @@ class LocalizationPart(Part):
             raise ConfigError(f"{key} = {stated!r} is of kind '{owner}', and {why}; {remedy}")
 
 
+OF_LEADERS = ("algorithm1", "equivalent", "ignore")
+"""Policies of late data that only the kind `leader` has."""
+
+
+class ThenPart(Part):
+    """Another policy from `at_s` after the start on."""
+
+    at_s: NotNegative
+    kind: LatenessKind
+
+
 class LatenessPart(Part):
-    kind: Literal["compensate", "replay", "discard"] = "compensate"
+    """What happens to what comes late; see docs/late-measurements.md."""
+
+    kind: LatenessKind = "compensate"
+    then: ThenPart | None = None
+    iterations: Annotated[int, Field(ge=1, le=10)] | None = None
     settle_s: NotNegative = 0.0
     tolerance_s: NotNegative = 0.001
     horizon_s: Positive = 5.0
@@ -115,12 +157,36 @@ class LatenessPart(Part):
     def settings(self) -> LatenessSettings:
         return LatenessSettings(
             kind=self.kind,
+            then=None if self.then is None else (nanoseconds(self.then.at_s), self.then.kind),
+            iterations=2 if self.iterations is None else self.iterations,
             settle_ns=nanoseconds(self.settle_s),
             tolerance_ns=nanoseconds(self.tolerance_s),
             horizon_ns=nanoseconds(self.horizon_s),
             odometry_wait_ns=nanoseconds(self.odometry_wait_s),
             clock_sigma_ns=nanoseconds(self.clock_sigma_s),
         )
+
+    def check(self, localization: LocalizationPart, model: str) -> None:
+        """Raises `ConfigError` for a policy that a kind of localization does not have, and for a clock that nobody says
+        anything about."""
+        if localization.kind == "leader":
+            if model != "unicycle":
+                raise ConfigError(f"kind = 'leader' is of robots on the ground, not of '{model}'; take model = 'unicycle'")
+            if localization.clock_state and self.clock_sigma_s == 0.0:
+                raise ConfigError(
+                    "clock_state = true needs lateness.clock_sigma_s above 0: how well clocks agree by themselves"
+                )
+            return
+        kinds = [self.kind] if self.then is None else [self.kind, self.then.kind]
+        other = next((kind for kind in kinds if kind in OF_LEADERS), None)
+        if other is not None:
+            raise ConfigError(
+                f"lateness.kind = '{other}' is of kind 'leader' alone: elsewhere it would count what is late twice, or as "
+                "of another instant; take 'compensate', 'replay' or 'discard'"
+            )
+        for key in ("iterations", "then"):
+            if getattr(self, key) is not None:
+                raise ConfigError(f"lateness.{key} is of kind 'leader', not of '{localization.kind}'; leave it out")
 
 
 class HealthPart(Part):
@@ -185,6 +251,7 @@ class LinksPart(Part):
     loss: Share = 0.0
     delay_s: NotNegative = 0.0
     delay_tail_s: NotNegative = 0.0
+    delay_spread_s: NotNegative = 0.0
     duplicate: Share = 0.0
 
     def settings(self, seed: int) -> LinkSettings:

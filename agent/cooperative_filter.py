@@ -7,14 +7,14 @@ Instants may lie in the past of the filter's own: late data are used or counted,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.effects import Effect, Estimate, Send
 from agent.estimation.observation import AbsoluteModel, RelativeModel
-from agent.events import LinkChange, Observation, Received
+from agent.events import Completed, LinkChange, Observation, Received
 from agent.saved_state import Saved
 from network.messages import Body, Epoch, Measurement, PairReply, ReplyStatus
 
@@ -32,6 +32,22 @@ class FilterMark:
 
     owner: object
     kept: object
+
+
+@runtime_checkable
+class Completing(Protocol):
+    """A filter whose measurements of a peer are own data once the peer has told of itself, and need nothing of it then.
+
+    Nobody is told of its belief: it may be made again as far back as anybody likes, whatever was sent or heard since.
+    """
+
+    def completed(self) -> list[Completed]:
+        """What was completed since this was asked last."""
+        ...
+
+    def use(self, item: Completed) -> None:
+        """Use one of them, at its instant or late."""
+        ...
 
 
 class CooperativeFilter(Protocol):

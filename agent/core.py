@@ -13,7 +13,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from agent.cooperative_filter import CooperativeFilter
+from agent.cooperative_filter import Completing, CooperativeFilter
 from agent.effects import Alarm, Effect, Estimate, Persist, Publish, Send
 from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError
 from agent.events import (
@@ -40,6 +40,7 @@ from agent.saved_state import decode, encode
 from agent.settings import AgentSettings
 from agent.timeline import MAX_INCREMENTS, MAX_WAITING, Item, OdometryTrack, Phase, Timeline
 from agent.waiting_filter import WaitingFilter
+from network.leader_messages import LeaderRequest
 from network.messages import PairReply, PairRequest, RoundReport, SplitReply, SplitRequest, StartRequest
 
 
@@ -57,7 +58,7 @@ class Agent:
         self.nis = self.figures.nis
         self.now_ns = settings.start_ns if restored is None else restored.t_ns
         lateness = settings.lateness
-        replayed = lateness.kind == "replay"
+        replayed = "replay" in lateness.kinds
         self._timeline = Timeline(by_content=replayed)
         self._odometry = OdometryTrack(settings.coast, settings.lateness.tolerance_ns, self.counters)
         saved = None if restored is None else restored.saved
@@ -71,6 +72,7 @@ class Agent:
             self._log = ReplayLog(lateness.horizon_ns, lateness.tolerance_ns, self.filter.t_ns, self.counters)
         self._pilot = Pilot(settings, self.counters) if settings.planning.kind != "none" else None
         self._again_until_ns = self.filter.t_ns
+        self._replays = self._replaying()
         self._commit()
         self._persisted: object = None
         self._persist_due_ns = self.now_ns
@@ -87,6 +89,11 @@ class Agent:
         """Take one event; returns the effects to be carried out, in order."""
         self.now_ns = max(self.now_ns, event.t_ns)
         effects: list[Effect] = []
+        if self._replays != self._replaying():
+            # What was used by another policy is not in the log.
+            self._rewind()
+            self._replays = self._replaying()
+            self._commit()
         try:
             self._take(event, effects)
         except np.linalg.LinAlgError:
@@ -231,8 +238,10 @@ class Agent:
                     self._clocks_off.add(peer)
 
     def _take_odometry(self, event: Odometry) -> None:
-        if self._log is None:
+        if self._log is None or not self._replays:
             self._odometry.add(event, self.filter.t_ns)
+            if self._log is not None:
+                self._log.odometry(event)
             return
         since_ns = self._log.odometry(event)
         if since_ns is None:
@@ -243,7 +252,7 @@ class Agent:
             self._odometry.put(event)
 
     def _queue(self, item: Item) -> None:
-        log = None if isinstance(item.event, Received) else self._log
+        log = self._log if self._replays and not isinstance(item.event, Received) else None
         if item.t_ns > self.now_ns + self.settings.lateness.horizon_ns:
             self.counters["input.future"] += 1
         elif log is None or log.take(item, self.filter.t_ns):
@@ -273,7 +282,9 @@ class Agent:
         peer, body = event.message.header.source, event.message.body
         if not plausible(body):
             self.counters["pair.implausible"] += 1
-        elif isinstance(body, PairRequest | SplitRequest | StartRequest):
+        elif isinstance(body, PairRequest | SplitRequest | StartRequest) or (
+            isinstance(body, LeaderRequest) and isinstance(self.filter, Completing)
+        ):
             asked_ns = self._asked_ns(event)
             if self._work.allowed(peer, self.now_ns, asked_ns):
                 self._queue(Item(asked_ns, Phase.PAIR, peer, event))
@@ -290,6 +301,13 @@ class Agent:
                 self._pilot.heard(event)
             with self._told(effects):
                 self.filter.heard(event, effects)
+            self._complete()
+
+    def _complete(self) -> None:
+        """Measurements of a peer that its word has completed are own data of their instants from now on."""
+        if isinstance(self.filter, Completing):
+            for event in self.filter.completed():
+                self._queue(Item(event.t_meas_ns, Phase.PRIVATE, event.sensor, event))
 
     def _asked_ns(self, event: Received) -> int:
         """The instant that a peer's request refers to, on the own clock."""
@@ -366,11 +384,12 @@ class Agent:
 
     def _use(self, item: Item, effects: list[Effect]) -> None:
         """Process an item at its instant; what was used before doesn't count again."""
-        if self._log is None:
-            self._instant().process(item, effects)
-        elif isinstance(item.event, Received) or item.phase is Phase.PAIR:
+        if isinstance(item.event, Received) or item.phase is Phase.PAIR:
             with self._told(effects):
                 self._instant().process(item, effects)
+            self._complete()
+        elif self._log is None or not self._replays:
+            self._instant().process(item, effects)
         else:
             late = item.t_ns < self.filter.t_ns - self.settings.lateness.tolerance_ns
             with self.figures.kept(self._log.used(item, self.filter.t_ns)):
@@ -380,13 +399,20 @@ class Agent:
 
     @contextmanager
     def _told(self, effects: list[Effect]) -> Iterator[None]:
-        """Whatever peers are told or have told can't be taken back."""
+        """Whatever peers are told or have told can't be taken back, unless it is nothing of the belief."""
+        if isinstance(self.filter, Completing):
+            yield
+            return
         revision, count = self.filter.revision, len(effects)
         try:
             yield
         finally:
             if self.filter.revision is not revision or len(effects) > count:
                 self._commit()
+
+    def _replaying(self) -> bool:
+        """Whether late data lead back to their instants now."""
+        return self.settings.lateness.kind_at(self.now_ns - self.settings.start_ns) == "replay"
 
     def _commit(self) -> None:
         """What was used up to now is not to be used again."""

@@ -39,6 +39,14 @@ class _Entry:
     after: Array
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CourseMark:
+    """A newest belief, and the left factor of updates at its instant."""
+
+    moment: Moment
+    after: Array
+
+
 class Course:
     """A ring of beliefs; `angles` are the components that wrap."""
 
@@ -66,6 +74,22 @@ class Course:
             surplus += 1
         if surplus:
             del self._entries[:surplus], self._stamps[:surplus]
+
+    def mark(self) -> CourseMark:
+        """The newest belief as it is."""
+        entry = self._entries[-1]
+        return CourseMark(entry.moment, entry.after)
+
+    def rewind(self, mark: CourseMark) -> None:
+        """Forget what came after a mark, before whose instant nothing was changed since."""
+        index = bisect_left(self._stamps, mark.moment.t_ns)
+        del self._entries[index + 1 :], self._stamps[index + 1 :]
+        self._entries[index].moment, self._entries[index].after = mark.moment, mark.after
+
+    def next_after(self, t_ns: int) -> Moment | None:
+        """The belief of the oldest instant that is later than `t_ns`; None if there is none."""
+        index = bisect_right(self._stamps, t_ns)
+        return self._entries[index].moment if index < len(self._entries) else None
 
     def at(self, t_ns: int) -> Moment | None:
         """The belief of the newest instant that is not later than `t_ns`; None if that has been forgotten."""

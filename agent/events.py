@@ -71,6 +71,26 @@ class Observation:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Completed:
+    """An own measurement of the leader, and the leader's word about where it was then; nothing comes in with it.
+
+    z, R, mount       as of an `Observation`
+    place, place_cov  (2,) and (2, 2), ENU
+    velocity          (2,) [m/s], ENU
+    """
+
+    t_meas_ns: int
+    kind: str
+    z: Array
+    R: Array
+    place: Array
+    place_cov: Array
+    velocity: Array
+    mount: Mount = NO_MOUNT
+    sensor: str = "leader"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Received:
     """A message that passed the endpoint, with the clock offset of its sender as known then.
 

@@ -13,6 +13,7 @@ from agent.fixed_filter import FixedFilter
 from agent.health import Health
 from agent.jlatt_filter import JlattFilter
 from agent.joint_filter import JointFilter
+from agent.leader_filter import LeaderFilter
 from agent.replica_filter import ReplicaFilter
 from agent.saved_state import Saved, SavedFactors, SavedSplit
 from agent.settings import AgentSettings
@@ -30,7 +31,7 @@ def build_filter(
 ) -> CooperativeFilter:
     """The filter of `settings.localization`; of a robot that does not know where it is, one that waits for it.
 
-    Who tracks by bearings of many has one that knows no targets, and a triangulator beside it. `saved`: what it begins
+    Who follows a leader trusts it. Who tracks by bearings of many has one that knows no targets, and a triangulator beside it. `saved`: what it begins
     with, which is of the form of the settings (`agent.saved_state.decode`). The kind `replica` judges no peer.
     """
     if settings.tracking.kind == "own" or not settings.track:
@@ -48,6 +49,8 @@ def _localizing(
 ) -> CooperativeFilter:
     if settings.localization.kind == "fixed" and settings.source == "survey":
         return FixedFilter(settings, counters, saved if isinstance(saved, SavedSplit) else None)
+    if settings.localization.kind == "leader" and settings.source == "survey":
+        return LeaderFilter(settings, counters, count_nis, saved if isinstance(saved, SavedSplit) else None)
     if isinstance(saved, SavedFactors):
         kept = JointFilter if settings.localization.form == "joint" else FactorFilter
         return kept(settings, counters, count_nis, saved, health=health)

@@ -6,10 +6,10 @@ from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from agent.cooperative_filter import CooperativeFilter
+from agent.cooperative_filter import Completing, CooperativeFilter
 from agent.effects import Effect
 from agent.estimation.observation import absolute_model, relative_model, told
-from agent.events import Fix, Observation, Received
+from agent.events import Completed, Fix, Observation, Received
 from agent.settings import AgentSettings
 from agent.timeline import Item, Phase, Timeline
 
@@ -43,6 +43,9 @@ class Instant:
                 self.filter.absolute(item.t_ns, event.kind, *fix)
             else:
                 self.counters["fix.unused_kind"] += 1
+        elif isinstance(event, Completed):
+            assert isinstance(self.filter, Completing)
+            self.filter.use(event)
         elif item.phase is Phase.PRIVATE:
             self._landmark(item.t_ns, event)
         elif item.phase is Phase.TARGET:

@@ -33,9 +33,13 @@ class PairClocks:
         remember(self._sigma_ns, event.message.header.source, round(share**0.5 * sigma))
         return round(share * event.offset_ns)
 
+    def sigma_s(self, peer: str) -> float:
+        """Standard deviation [s] of a peer's offset, as of the last `offset_ns`."""
+        return self._sigma_ns.get(peer, self._settings.lateness.clock_sigma_ns) * 1e-9
+
     def widened(self, peer: str, item: Measurement) -> Measurement:
         """R widened by how far the peer may move within the uncertainty of its clock (coasting speed)."""
-        sigma_s = self._sigma_ns.get(peer, self._settings.lateness.clock_sigma_ns) * 1e-9
+        sigma_s = self.sigma_s(peer)
         if sigma_s == 0.0:
             return item
         moved = (self._settings.coast.speed_mps * sigma_s) ** 2

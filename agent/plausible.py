@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from agent.estimation.gaussian import quadratic_form, wrap_components
 from agent.estimation.motion import STATES
 from agent.settings import HealthSettings
+from network.leader_messages import LeaderReport
 from network.messages import (
     BearingReport,
     Body,
@@ -43,6 +44,8 @@ def plausible(body: Body) -> bool:
         return _round_possible(body)
     if isinstance(body, BearingReport):
         return _bearings_possible(body)
+    if isinstance(body, LeaderReport):
+        return bool(np.abs(body.place).max() <= FARTHEST and body.cov.diagonal().min() >= SUREST)
     if not isinstance(body, PairRequest | PairReply | SplitRequest | SplitReply) or body.snapshot is None:
         return True
     return all(_possible(*part) for part in _beliefs(body.snapshot))

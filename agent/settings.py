@@ -21,6 +21,10 @@ RoundWeights = Literal["split_ci", "trace", "logdet", "info", "pinv_guard"]
 """How information that may be correlated is weighed: see `agent.estimation.jlatt`."""
 
 
+LatenessKind = Literal["compensate", "replay", "discard", "algorithm1", "equivalent", "ignore"]
+"""What happens to data that come late."""
+
+
 def nanoseconds(seconds: float) -> int:
     """Seconds as integer nanoseconds, rounded to the nearest."""
     return round(seconds * NS)
@@ -29,8 +33,13 @@ def nanoseconds(seconds: float) -> int:
 @dataclass(frozen=True, slots=True)
 class LocalizationSettings:
     """Cooperative localization: `clat`, by contacts of pairs; `replica`, by raw data told to the whole team;
-    `jlatt`, by rounds in which neighbours tell their beliefs; `fixed`, not at all: the pose is what fixes say.
+    `jlatt`, by rounds in which neighbours tell their beliefs; `leader`, by a leader that tells where it was; `fixed`,
+    not at all: the pose is what fixes say.
 
+    leader, exchange  who leads, and whether it tells everybody once per round, or who asks
+    fixes             of the leader: they are `fused`, or `trusted` as by the kind `fixed`
+    leader_correlation_ns  the time in which the error of what the leader tells becomes another one; 0: each is new
+    clock_state       the remaining offset of the leader's clock is a state
     weights                           how `jlatt` weighs what may be correlated
     sighting_weight / fusion_weight   how intersections choose their weight
     pair_interval_ns                  least time between two contacts of a pair that are used
@@ -39,8 +48,13 @@ class LocalizationSettings:
     max_lines                         identity lines kept per peer
     """
 
-    kind: Literal["clat", "replica", "jlatt", "fixed"] = "clat"
+    kind: Literal["clat", "replica", "jlatt", "leader", "fixed"] = "clat"
     form: Literal["auto", "split_joint", "safe", "published", "joint"] = "auto"
+    leader: str = ""
+    exchange: Literal["broadcast", "request"] = "broadcast"
+    fixes: Literal["fused", "trusted"] = "fused"
+    leader_correlation_ns: int = 0
+    clock_state: bool = False
     transform: Transform = "unscented"
     correlation: Literal["factors", "ignored"] = "factors"
     sighting_weight: Weight = "trace"
@@ -130,7 +144,10 @@ class LatenessSettings:
     """When data are fused and what happens to those that come late.
 
     kind               late own data: `compensate`, by a delayed update; `replay`, in their place by a bounded rewind as
-                       far back as the last contact; `discard`
+                       far back as the last contact; `discard`. Of the kind `leader` also `algorithm1`, `equivalent`
+                       and `ignore`, and `compensate` is what is published; see `agent.late_words`
+    then               the kind from so long [ns] after the start on
+    iterations         passes of an update by the leader
     settle_ns          an instant is processed once it is this old, so that all its data are in
     tolerance_ns       stamps this close to a state instant count as that instant
     horizon_ns         how far the history reaches back
@@ -139,12 +156,23 @@ class LatenessSettings:
                        Measured offsets are blended with this prior.
     """
 
-    kind: Literal["compensate", "replay", "discard"] = "compensate"
+    kind: LatenessKind = "compensate"
+    then: tuple[int, LatenessKind] | None = None
+    iterations: int = 2
     settle_ns: int = 0
     tolerance_ns: int = 1_000_000
     horizon_ns: int = 5 * NS
     odometry_wait_ns: int = NS
     clock_sigma_ns: int = 0
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """All kinds that are ever on."""
+        return (self.kind,) if self.then is None else (self.kind, self.then[1])
+
+    def kind_at(self, age_ns: int) -> str:
+        """The kind that is on so long after the start."""
+        return self.kind if self.then is None or age_ns < self.then[0] else self.then[1]
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,6 +69,10 @@ class TrackingPart(Part):
 
     def check_kind(self, localization: LocalizationPart, without_prior: Sequence[str]) -> None:
         """Raises `ConfigError` if tracks are to start or end, and the filter has the same ones all the time."""
+        if localization.kind == "leader" and self.kind not in ("clat", "none"):
+            raise ConfigError(
+                f"tracking.kind = '{self.kind}' does not go with kind = 'leader', which tracks nothing; take 'none'"
+            )
         rigid = localization.rigid()
         if rigid is None or self.kind != "clat":
             return

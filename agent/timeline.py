@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.motion import split_increment
-from agent.events import Fix, Observation, Odometry, Received
+from agent.events import Completed, Fix, Observation, Odometry, Received
 from agent.settings import CoastSettings
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ class Item:
     t_ns: int
     phase: Phase
     source: str
-    event: Fix | Observation | Received
+    event: Fix | Observation | Completed | Received
 
 
 ItemKey = tuple[int, Phase, str, str, str, bytes, bytes]

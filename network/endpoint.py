@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
+from network.leader_messages import LeaderReport, LeaderRequest
 from network.messages import (
     MAX_ECHOES,
     MAX_MESSAGE_BYTES,
@@ -399,6 +400,8 @@ def _belongs(body: Body, channel: str) -> bool:
     """Whether a body of this type may travel on this channel."""
     if isinstance(body, Hello):
         return channel == Channel.HELLO
-    if isinstance(body, LifeNotice | PairRequest | PairReply | SplitRequest | SplitReply | StartRequest):
+    if isinstance(body, LifeNotice | PairRequest | PairReply | SplitRequest | SplitReply | StartRequest | LeaderRequest):
+        return channel == Channel.PAIR
+    if isinstance(body, LeaderReport) and body.answers is not None:
         return channel == Channel.PAIR
     return channel == Channel.BELIEF

@@ -39,7 +39,8 @@ class LinkSettings:
     nearest       a robot hears so many of those in range, the nearest; None: all
     rewire        a robot hears so many of those in range, drawn anew at every instant; None: all
     loss          probability that a packet is lost
-    delay_s       shortest delay; an exponential tail of mean `delay_tail_s` comes on top
+    delay_s       shortest delay; up to `delay_spread_s`, evenly drawn, and an exponential tail of mean `delay_tail_s`
+                  come on top
     duplicate     probability that a packet arrives twice
     """
 
@@ -52,13 +53,14 @@ class LinkSettings:
     delay_s: float = 0.0
     delay_tail_s: float = 0.0
     duplicate: float = 0.0
+    delay_spread_s: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**64:
             raise ValueError("seed must lie within 0 and 2**64 - 1")
         if self.range_m is not None and not 0.0 <= self.range_m < math.inf:
             raise ValueError("range_m must be finite and not negative, or None")
-        for name in ("hysteresis_m", "delay_s", "delay_tail_s"):
+        for name in ("hysteresis_m", "delay_s", "delay_tail_s", "delay_spread_s"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be finite and not negative")
         for name in ("loss", "duplicate"):
@@ -93,15 +95,19 @@ def packet_fate(
     """
     parcel = Parcel(source, destination, channel, incarnation, seq, 0)
     loss, duplicate, tail, second_tail = uniforms(settings.seed, "", parcel)
+    spread, second_spread = 0.0, 0.0
+    if settings.delay_spread_s > 0.0:
+        spread, second_spread, *_ = uniforms(settings.seed, "spread", parcel)
     return Fate(
         lost=loss < settings.loss,
-        delay_ns=_delay_ns(settings, tail),
-        duplicate_delay_ns=_delay_ns(settings, second_tail) if duplicate < settings.duplicate else None,
+        delay_ns=_delay_ns(settings, tail, spread),
+        duplicate_delay_ns=_delay_ns(settings, second_tail, second_spread) if duplicate < settings.duplicate else None,
     )
 
 
-def _delay_ns(settings: LinkSettings, uniform: float) -> int:
-    return round(settings.delay_s * 1e9) + exponential_ns(settings.delay_tail_s * 1e9, uniform)
+def _delay_ns(settings: LinkSettings, tail: float, spread: float) -> int:
+    least_ns = round((settings.delay_s + spread * settings.delay_spread_s) * 1e9)
+    return least_ns + exponential_ns(settings.delay_tail_s * 1e9, tail)
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,8 +167,8 @@ class LinkModel:
         self._link_state = link_state
         self._limited = settings.limited
         self._log = log
-        chance = settings.loss > 0.0 or settings.duplicate > 0.0 or settings.delay_tail_s > 0.0
-        self._only_fate = None if chance else Fate(False, _delay_ns(settings, 0.0), None)
+        drawn = (settings.loss, settings.duplicate, settings.delay_tail_s, settings.delay_spread_s)
+        self._only_fate = None if max(drawn) > 0.0 else Fate(False, _delay_ns(settings, 0.0, 0.0), None)
 
     def carry(self, packet: Packet, header: Header, destination: str, t_send_ns: int) -> list[tuple[int, Packet]]:
         """(delay [ns], packet) of everything that arrives of a packet sent at `t_send_ns` of fleet time."""

@@ -15,6 +15,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
+from network.leader_messages import LeaderReport, LeaderRequest
 from network.messages import (
     MAX_ECHOES,
     MAX_JOINT_DIM,
@@ -53,6 +54,7 @@ from network.wire_fields import (
     read_measurement,
     read_text,
 )
+from network.wire_leader import pack_request, pack_word, read_request, read_word
 from network.wire_round import pack_round, read_round
 from network.wire_snapshots import (
     pack_joint,
@@ -67,6 +69,7 @@ from network.wire_team import pack_report, read_report
 _HELLO, _PAIR_REQUEST, _PAIR_REPLY, _SPLIT_REQUEST, _SPLIT_REPLY, _TEAM_REPORT = 1, 2, 3, 4, 5, 6
 _JOINT_REQUEST, _JOINT_REPLY, _START_REQUEST, _LIFE_NOTICE, _ROUND_REPORT = 7, 8, 9, 10, 11
 _BEARING_REPORT = 12
+_LEADER_REQUEST, _LEADER_REPORT = 15, 16
 _HEADER_BYTES = 3 + 25 + 5 * 9 + 1
 """Upper bound of what surrounds a body: array marks, schema, longest source, five integers, kind."""
 
@@ -151,6 +154,10 @@ def _pack_body(body: Body) -> tuple[int, tuple[Any, ...]]:
         return _ROUND_REPORT, pack_round(body)
     if isinstance(body, BearingReport):
         return _BEARING_REPORT, pack_bearings(body)
+    if isinstance(body, LeaderRequest):
+        return _LEADER_REQUEST, pack_request(body)
+    if isinstance(body, LeaderReport):
+        return _LEADER_REPORT, pack_word(body)
     if isinstance(body, StartRequest):
         return _START_REQUEST, (pack_epoch(body.epoch),)
     if isinstance(body, LifeNotice):
@@ -312,4 +319,6 @@ _BODIES: dict[int, Callable[[Any, Header], Body]] = {
     _LIFE_NOTICE: _life_notice,
     _ROUND_REPORT: read_round,
     _BEARING_REPORT: read_bearings,
+    _LEADER_REQUEST: read_request,
+    _LEADER_REPORT: read_word,
 }

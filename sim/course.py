@@ -1,4 +1,4 @@
-"""Courses that targets follow whatever happens: pieces of constant turn rate about the vertical, turns on the spot, and
+"""Courses that targets, and robots on the ground, follow whatever happens: pieces of constant turn rate about the vertical, turns on the spot, and
 flight at random (`sim.wander`).
 
 The velocity at instant k is the one that carried the target from instant k - 1 to k, so p(k) = p(k - 1) + dt v(k).
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.config_file import ConfigError, Finite, Part, Positive, Vector3
+from agent.estimation.gaussian import wrap
 from agent.estimation.motion import LAYOUTS, StateLayout
 from agent.settings import nanoseconds
 from sim.wander import wandered
@@ -84,6 +85,11 @@ class CoursePart(Part):
             if key != "kind" and key not in KEYS[self.kind] and getattr(self, key) != field.default:
                 raise ConfigError(f"course.{key} is not of kind '{self.kind}'; leave it out")
         layout = LAYOUTS[model]
+        if model == "unicycle" and self.kind in ("circle", "pieces"):
+            self.stretches()
+            if any(piece.turn_rad for piece in self.stretches()):
+                raise ConfigError("course.pieces: a robot on the ground turns on its way; leave turn_rad out")
+            return
         if layout.heading is not None or layout.dim != 2 * len(layout.position):
             raise ConfigError(
                 f"course: the model '{model}' does not move by a velocity alone; take 'constant_velocity_3d' or "
@@ -124,6 +130,19 @@ def followed(
     moves = track[1:, axes:] * (step_ns * 1e-9)
     track[1:, :axes] += np.cumsum(moves, axis=0)
     return track
+
+
+def driven_along(course: CoursePart, start: Array, speed_mps: float, step_ns: int, steps: int) -> tuple[Array, Array]:
+    """True poses (steps + 1, 3) on the ground at a constant speed, and what a perfect odometry says of each step
+    (steps, 3): straight on, and then the turn."""
+    turned = _turned(course.stretches(), step_ns, steps)
+    heading = start[2] + turned
+    way = speed_mps * step_ns * 1e-9
+    track = np.zeros((steps + 1, 3))
+    track[0], track[:, 2] = start, wrap(heading)
+    along = way * np.stack([np.cos(heading[:-1]), np.sin(heading[:-1])], axis=1)
+    track[1:, :2] = start[:2] + np.cumsum(along, axis=0)
+    return track, np.stack([np.full(steps, way), np.zeros(steps), np.diff(turned)], axis=1)
 
 
 def _turned(pieces: list[PiecePart], step_ns: int, steps: int) -> Array:

@@ -43,7 +43,7 @@ Array = NDArray[np.float64]
 MAX_COUNTERS = 256
 ROUNDING = 1e-9
 
-LEARNING = ("pair.applied", "pair.quarantined", "pair.gated", "start.", "track.", "team.")
+LEARNING = ("pair.applied", "pair.quarantined", "pair.gated", "start.", "track.", "team.", "leader.")
 """Counters that tell of information used besides those of the NIS, or of an instant it was looked at for.
 
 Motion up to such an instant and from there is not quite the motion over the whole step.

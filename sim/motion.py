@@ -10,7 +10,7 @@ from agent.config_parts import start_size
 from agent.estimation.gaussian import wrap
 from agent.estimation.motion import LAYOUTS, SPATIAL, UNICYCLE_GAINS, StateLayout, velocity_step
 from agent.settings import nanoseconds
-from sim.course import followed
+from sim.course import driven_along, followed
 from sim.noise import normal_rows
 from sim.scenario import RobotPart, Scenario, TargetPart
 
@@ -28,6 +28,8 @@ def driven(scenario: Scenario, mover: RobotPart | TargetPart, start: Array, seed
         if mover.course is not None:
             return followed(mover.course, layout, start, nanoseconds(scenario.step_s), steps, seed, mover.id)
         return _drifted(scenario, mover, layout, start, seed, steps)
+    if mover.course is not None:
+        return driven_along(mover.course, start, mover.control.speed_mps, nanoseconds(scenario.step_s), steps)[0]
     dt = scenario.step_s
     noise = normal_rows(seed, steps, 2, mover.id, "control")
     track = np.zeros((steps + 1, layout.dim))

@@ -123,7 +123,7 @@ class SensorPart(Part):
     (`bearing3`) err by `noise`, see `sim.directions`. Who could be seen is detected with the probability `detects`; the
     share `false_share` of detections is of a direction drawn evenly. With a `gimbal` the field of view is a cone about
     where the camera saw a target last, see `sim.gimbal`. A recorded camera has the mount and intrinsics of the
-    recording.
+    recording. The error of absolute information lasts for `correlation_s` (first-order; 0: each is a new one).
     """
 
     kind: SensorKind | None = None
@@ -136,6 +136,7 @@ class SensorPart(Part):
     noise: DirectionNoise = "angles"
     detects: Share = 1.0
     false_share: Share = 0.0
+    correlation_s: NotNegative = 0.0
     bias_m: Finite = 0.0
     bias_of: dict[str, Finite] = {}
     max_range_m: Positive | None = None
@@ -191,6 +192,7 @@ class AutopilotPart(Part):
 class RobotPart(Part):
     """A robot.
 
+    With a `course` it follows that exactly, at its commanded speed, and the noise is what its odometry is off by.
     `start_source` is where it has its start from, see `agent.start_config`; `tilt_rad` is the standard deviation of its
     roll and pitch, new at every instant and known to it.
     """
@@ -201,6 +203,7 @@ class RobotPart(Part):
     start: StartPart = StartPart()
     start_sigma: SigmaPart
     start_source: StartSource = "survey"
+    course: CoursePart | None = None
     control: ControlPart = ControlPart()
     noise: ControlNoisePart = ControlNoisePart()
     odometry: OdometryPart | None = None

@@ -79,7 +79,6 @@ def check(scenario: Scenario) -> None:
                 f"{scenario.name}: robots.{robot.id}.model = '{robot.model}' has {has} altitude, and recordings of "
                 f"format '{scenario.world.format}' are {kind}; take '{other}'"
             )
-        scenario.lateness_of(robot)
         try:
             scenario.health.settings(scenario.localization_of(robot).form)
         except ConfigError as error:
@@ -87,6 +86,7 @@ def check(scenario: Scenario) -> None:
         localization, tracking = scenario.localization_of(robot), scenario.tracking_of(robot)
         try:
             localization.settings()
+            scenario.lateness_of(robot).check(localization, robot.model)
             tracking.check_kind(localization, [target.id for target in scenario.targets if not target.prior])
             tracking.check_targets([(target.id, target.model) for target in scenario.targets])
             if localization.form == "joint":
@@ -101,6 +101,7 @@ def check(scenario: Scenario) -> None:
             raise ConfigError(f"{scenario.name}: robots.{robot.id}.start_{error}") from None
         if not recorded and (robot.start.pose is None) == (robot.start.circle is None):
             raise ConfigError(f"{scenario.name}: robots.{robot.id}.start needs either 'pose' or 'circle'")
+        _check_driven(f"{scenario.name}: robots.{robot.id}", robot, recorded or scenario.world.steering is not None)
         if robot.start.circle is not None and scenario.world.placement is None:
             raise ConfigError(f"{scenario.name}: robots.{robot.id}.start.circle needs a [world.placement]")
         for name, sensor in robot.sensors.items():
@@ -163,6 +164,14 @@ def _check_team(scenario: Scenario) -> None:
             raise ConfigError(
                 f"{scenario.name}: robots.{other}.localization.kind = '{kinds[other]}' beside '{kind}': {why}; "
                 "give all robots one kind"
+            )
+    for robot in scenario.robots:
+        leader = scenario.localization_of(robot).leader
+        if leader is not None and kinds.get(leader) != "leader":
+            there = f"has localization.kind = '{kinds[leader]}', and answers nobody" if leader in kinds else "is not there"
+            raise ConfigError(
+                f"{scenario.name}: robots.{robot.id}.localization.leader = '{leader}' {there}; take a robot of "
+                "kind 'leader'"
             )
     tracked = {scenario.tracking_of(robot).kind for robot in scenario.robots} - {"none"}
     if len(tracked) > 1:
@@ -253,6 +262,22 @@ def _check_steering(scenario: Scenario) -> None:
             raise ConfigError(f"{where}: robots.{robot.id}.model = '{robot.model}' is not steered; take 'unicycle'")
         if robot.control != ControlPart():
             raise ConfigError(f"{where}: robots.{robot.id}.control is not used with it; leave it out")
+
+
+def _check_driven(where: str, robot: RobotPart, led: bool) -> None:
+    """Who follows a course drives on the ground, and is moved by nothing else. Raises `ConfigError`."""
+    if robot.course is None:
+        return
+    if led or robot.model != "unicycle" or robot.planning.get("kind", "none") != "none":
+        raise ConfigError(f"{where}.course is of a 'unicycle' in a simulated world that nothing else moves; leave it out")
+    if robot.course.kind not in ("circle", "pieces"):
+        raise ConfigError(f"{where}.course.kind = '{robot.course.kind}' is of targets; take 'pieces' or 'circle'")
+    if robot.control.yaw_rate_radps:
+        raise ConfigError(f"{where}.control.yaw_rate_radps is not used with a course; leave it out")
+    try:
+        robot.course.check(robot.model)
+    except ConfigError as error:
+        raise ConfigError(f"{where}.{error}") from None
 
 
 def _check_course(where: str, target: TargetPart) -> None:

@@ -7,16 +7,18 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from agent.effects import Steer
 from agent.estimation.gain_motion import reported
 from agent.estimation.gaussian import wrap, wrap_components
-from agent.estimation.motion import LAYOUTS, SPATIAL, UNICYCLE_GAINS
+from agent.estimation.motion import LAYOUTS, PLANAR, SPATIAL, UNICYCLE_GAINS
 from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, OutOfViewError
 from agent.estimation.odometry import OdometryNoise
 from agent.settings import NS, nanoseconds
 from agent.timeline import Phase
 from sim.closed_loop import ClosedLoop, Motion, planar_of
+from sim.course import driven_along
 from sim.directions import DRAWS, anywhere, direction_covariance, direction_of, disturbed, vector
 from sim.gimbal import Gimbal, level_turned
 from sim.motion import driven
@@ -177,6 +179,13 @@ class SimulatedWorld:
         self._layouts = {name: LAYOUTS[part.model] for name, part in movers.items()}
         self._places = np.stack([places(self._tracks[name], layout) for name, layout in self._layouts.items()])
         self._fixed = np.array([(*point, 0.0)[:3] for point in self.landmarks.values()]).reshape(-1, 3)
+        self._driven = {
+            robot.id: driven_along(
+                robot.course, starts[robot.id], robot.control.speed_mps, self.step_ns, self.steps
+            )[1]
+            for robot in scenario.robots
+            if robot.course is not None
+        }
         self._odometry_noise = {robot.id: control_odometry(robot, scenario.step_s) for robot in scenario.robots}
         self._sights = sights(scenario, self._tracks, self.landmarks)
         self._tilt = {
@@ -242,6 +251,11 @@ class SimulatedWorld:
         if robot.id in self.motion.moved:
             delta = self.motion.moved[robot.id][k - 1].copy()
         noise = self._odometry_noise[robot.id]
+        if robot.id in self._driven:
+            delta = np.zeros(4)
+            delta[list(PLANAR)] = self._driven[robot.id][k - 1]
+            off = np.sqrt(np.diagonal(noise.covariance(delta, dt)))
+            delta += off * self._noise(robot.id, "odometry", "", k, 4)
         if LAYOUTS[robot.model] is UNICYCLE_GAINS:
             delta[[0, 1, 3]] = reported(self._tracks[robot.id][k - 1], delta[[0, 1, 3]])
         delta = noise.calibrated(delta)
@@ -253,6 +267,18 @@ class SimulatedWorld:
         key = (robot, sensor, of)
         if key not in self._sensor_noise:
             self._sensor_noise[key] = normal_rows(self.seed, self.steps + 1, size, *key)
+        return np.asarray(self._sensor_noise[key][k])
+
+    def _lasting(self, robot: str, sensor: str, k: int, size: int, correlation_s: float) -> Array:
+        """Standard normal errors (size,) of instant k that last for a time, each as likely as the next."""
+        if correlation_s == 0.0:
+            return self._noise(robot, sensor, "", k, size)
+        key = (robot, sensor, "lasting")
+        if key not in self._sensor_noise:
+            keep = np.exp(-self._scenario.step_s / correlation_s)
+            rows = normal_rows(self.seed, self.steps + 1, size, robot, sensor, "")
+            rows[1:] *= np.sqrt(1.0 - keep**2)
+            self._sensor_noise[key] = lfilter([1.0], [1.0, -keep], rows, axis=0)
         return np.asarray(self._sensor_noise[key][k])
 
     def _chance(self, robot: str, name: str, sensor: SensorPart, of: str, k: int) -> Array | None:
@@ -271,7 +297,8 @@ class SimulatedWorld:
         if kind not in RELATIVE_ANGLES:
             R = absolute_noise(kind, sensor, layout is SPATIAL)
             fix = AbsoluteModel(kind, layout, len(R))
-            z = fix.h(state) + np.sqrt(np.diagonal(R)) * self._noise(robot.id, name, "", k, len(R))
+            error = self._lasting(robot.id, name, k, len(R), sensor.correlation_s)
+            z = fix.h(state) + np.sqrt(np.diagonal(R)) * error
             return [Output(t_ns, Phase.PRIVATE, robot.id, name, kind, None, wrap_components(z, fix.angles), R)]
         outputs = []
         attitude = self._attitude(robot.id, k)
