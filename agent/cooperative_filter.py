@@ -49,6 +49,10 @@ class Completing(Protocol):
         """Use one of them, at its instant or late."""
         ...
 
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """What waits or is kept, and the most there may be of it, by name."""
+        ...
+
 
 class CooperativeFilter(Protocol):
     """One robot's estimator. Nothing here raises on foreign input, except `numpy.linalg.LinAlgError`."""

@@ -146,8 +146,10 @@ class Agent:
     def sizes(self) -> dict[str, tuple[int, int]]:
         """What waits or is kept, and the most there may be of it, by name."""
         log = {} if self._log is None else self._log.sizes()
+        waiting = self.filter.sizes() if isinstance(self.filter, Completing) else {}
         return {
             **log,
+            **waiting,
             "timeline": (len(self._timeline), MAX_WAITING + (MAX_LOGGED if log else 0)),
             "odometry": (len(self._odometry), MAX_INCREMENTS),
             "figures": (len(self.nis), MAX_KINDS),

@@ -312,3 +312,76 @@ def correlation_table(trials: int, seed: int) -> str:
     cells = [play(found, seed, "replay", iterations=2, scale=scale) for scale in (1.0, 10.0, 25.0, 50.0)]
     heads = ["covariance as told", "10 times", "25 times", "50 times (tau_c / period)"]
     return table("Leader's error correlated over 5 s, 8 periods late, replay, 2 iterations", heads, [cells])
+
+
+# -- through agents and their network -----------------------------------------------------------------------------
+
+OF_SCENARIOS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
+    *(
+        (kind, "leader-follower", (f"lateness.kind={kind}", "lateness.iterations=1"))
+        for kind in ("ignore", "discard", "algorithm1", "compensate", "equivalent", "replay")
+    ),
+    ("replay, 2 iterations", "leader-follower", ()),
+    ("replay, 2 iterations, loss 0.3", "leader-follower", ("links.loss=0.3",)),
+    ("request, replay, 2 iterations", "leader-follower-request", ()),
+    ("0 to 8 periods, replay, 2 iterations", "leader-follower-variable", ()),
+    ("clock off by 0.15 s, stamps trusted", "leader-follower-offset", ("localization.clock_state=false",)),
+    ("clock off by 0.15 s, offset estimated", "leader-follower-offset", ()),
+    (
+        "error over 5 s, taken as new",
+        "leader-follower",
+        ("robots.r1.sensors.pose.correlation_s=5.0",),
+    ),
+    (
+        "error over 5 s, leader_correlation_s = 5",
+        "leader-follower",
+        ("robots.r1.sensors.pose.correlation_s=5.0", "localization.leader_correlation_s=5.0"),
+    ),
+)
+"""Name, scenario and what is set: 8 periods late, all of them."""
+
+
+def scenarios_table(trials: int, seed: int, jobs: int, out: Path) -> str:
+    """Figures of the follower. Raises `RuntimeError` if a command fails."""
+    rows = []
+    for name, scenario, changes in OF_SCENARIOS:
+        where = out / f"{scenario}-{len(rows)}-{trials}-{seed}"
+        command = ["montecarlo", scenario, "--trials", str(trials), "--seed", str(seed), "--jobs", str(jobs)]
+        command += ["--no-report", "--set", "expect={}"]
+        for change in changes:
+            command += ["--set", change]
+        run(command, where)
+        found = json.loads((where / "summary.json").read_text())["robots"]["r2"]
+        figures = Figures(
+            100.0 * found["position_rmse_m"], float(np.degrees(found["heading_rmse_rad"])), found["anees"]
+        )
+        rows.append([name, figures])
+    return table(f"Through agents and their network, 0.8 s late, {trials} trials each", ["case", "follower"], rows)
+
+
+TABLES = {
+    "delays": delays_table,
+    "exchanges": exchanges_table,
+    "clocks": clocks_table,
+    "correlation": correlation_table,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.delays", description=__doc__)
+    parser.add_argument("--trials", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--tables", nargs="*", default=list(TABLES), choices=list(TABLES))
+    parser.add_argument("--scenarios", type=int, default=0, metavar="N", help="trials through the network; 0: none")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="trials played at once")
+    parser.add_argument("--out", type=Path, default=Path("runs/delays"), help="where finished trials are")
+    options = parser.parse_args(arguments)
+    for name in options.tables:
+        print(TABLES[name](options.trials, options.seed), flush=True)
+    if options.scenarios:
+        print(scenarios_table(options.scenarios, options.seed, options.jobs, options.out), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

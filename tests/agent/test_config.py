@@ -258,7 +258,7 @@ MISTAKES: list[tuple[dict[str, Any], list[str]]] = [
     ({"zenoh": {"listen": "udp/127.0.0.1:1"}}, ["'zenoh.listen'", "list"]),
     ({"zenoh": {"listen": [], "lease_ms": 1}}, ["'zenoh.lease_ms' = 1", "100"]),
     ({"lateness": {"horizon_s": -1.0}}, ["'lateness.horizon_s' = -1.0", "greater than 0"]),
-    ({"lateness": {"kind": "hope"}}, ["'lateness.kind' = 'hope'", "'compensate', 'replay' or 'discard'"]),
+    ({"lateness": {"kind": "hope"}}, ["'lateness.kind' = 'hope'", "'compensate', 'replay', 'discard'"]),
     ({"state_dir": 3}, ["'state_dir' = 3", "string"]),
     ({"version": 9}, ["'version' = 9"]),
     ({"targets": [TARGET | {"mean": [0.0, 0.0]}]}, ["targets.t1.mean needs 4 numbers"]),

@@ -12,6 +12,11 @@ from sim.scenario import Scenario
 from sim.scenario_file import load
 from sim.trial import open_world
 
+VIEW = (
+    "robots.*.sensors.view={kind='range_bearing', of=['peers'], sigma_m=0.5, sigma_rad=0.02, rate_hz=2.0}",
+)
+"""A follower measures its leader."""
+
 FORMS = {
     "safe": ["localization.form=safe"],
     "published": ["localization.form=published"],
@@ -19,6 +24,14 @@ FORMS = {
     "split_joint": ["localization.form=split_joint"],
     "replica": ["localization.kind=replica"],
     "jlatt": ["localization.kind=jlatt"],
+    "leader": ["localization.kind=leader", "localization.leader=r1", "tracking.kind=none", *VIEW],
+    "asked_leader": [
+        "localization.kind=leader",
+        "localization.leader=r1",
+        "localization.exchange=request",
+        "tracking.kind=none",
+        *VIEW,
+    ],
     "icf_plus": [
         "tracking.kind=icf_plus",
         "robots.*.sensors.camera.kind=bearing",
@@ -31,7 +44,7 @@ FORMS = {
 }
 """`--set` overrides by form."""
 
-KINDS = frozenset((*range(1, 10), 11, 12))
+KINDS = frozenset((*range(1, 10), 11, 12, 15, 16))
 """Every kind of message of the wire format but the notice to a robot that is there twice."""
 
 

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from network.leader_messages import LeaderReport, LeaderRequest
 from network.messages import (
     MAX_ECHOES,
     MAX_GROUP,
@@ -167,6 +168,11 @@ def example_bearings() -> BearingReport:
     return BearingReport((seen,), told)
 
 
+def example_word() -> LeaderReport:
+    """A leader tells everybody where it was; its word before was of 100 ns earlier."""
+    return LeaderReport(np.array([1.5, -2.0]), np.diag([0.25, 0.5]), np.array([1.0, 0.5]), HEADER.t_meas_ns - 100)
+
+
 EXAMPLES: dict[str, Body] = {
     "hello": Hello("0.1.0", (ClockEcho("r2", 10, 20), ClockEcho("r3", 30, 40))),
     "pair_request": example_request(),
@@ -181,6 +187,9 @@ EXAMPLES: dict[str, Body] = {
     "start_request": StartRequest(Epoch(1000, "r1", 9)),
     "round_report": example_round(),
     "bearing_report": example_bearings(),
+    "leader_request": LeaderRequest(9),
+    "leader_report": example_word(),
+    "leader_answer": dataclasses.replace(example_word(), before_ns=None, answers=9),
     "life_notice": LifeNotice(2**53 - 1, 9, True),
 }
 
