@@ -167,7 +167,7 @@ def _check_team(scenario: Scenario) -> None:
             )
     for robot in scenario.robots:
         leader = scenario.localization_of(robot).leader
-        if leader is not None and kinds.get(leader) != "leader":
+        if kinds[robot.id] == "leader" and leader is not None and kinds.get(leader) != "leader":
             there = f"has localization.kind = '{kinds[leader]}', and answers nobody" if leader in kinds else "is not there"
             raise ConfigError(
                 f"{scenario.name}: robots.{robot.id}.localization.leader = '{leader}' {there}; take a robot of "
