@@ -44,6 +44,7 @@ from agent.estimation.motion import LAYOUTS
 from agent.estimation.mounting import mount_of
 from agent.fault_parts import FaultPart
 from agent.joint_room import check_room
+from agent.leader_parts import check_lateness
 from agent.mavlink_endpoint import MavlinkEndpointError, parse_endpoint
 from agent.motion_parts import OdometryPart
 from agent.planning_parts import PlanningPart, RoundPart
@@ -281,7 +282,7 @@ def load_agent_config(path: Path) -> AgentConfig:
         raise ConfigError(f"{path}: initial.{error}") from None
     try:
         config.localization.settings()
-        config.lateness.check(config.localization, config.motion.model)
+        check_lateness(config.lateness, config.localization, config.motion.model)
         config.tracking.check_kind(config.localization, [t.id for t in config.targets if t.mean is None])
         config.tracking.check_targets([(target.id, target.model) for target in config.targets])
         if config.localization.form == "joint":

@@ -69,7 +69,7 @@ class LocalizationPart(Part):
             for key in ("leader", "exchange", "fixes", "leader_correlation_s", "clock_state"):
                 self._refuse(key, "leader", f"kind '{self.kind}' follows nobody")
         elif self.leader is None:
-            raise ConfigError("leader is missing: kind = 'leader' needs the id of who leads, for instance leader = 'r1'")
+            raise ConfigError("leader is missing: kind = 'leader' needs the id of who leads, as leader = 'r1'")
         if self.kind == "fixed":
             self._refuse("innovation_cap", "clat", "kind 'fixed' has no innovations")
         if self.kind != "clat":
@@ -130,10 +130,6 @@ class LocalizationPart(Part):
             raise ConfigError(f"{key} = {stated!r} is of kind '{owner}', and {why}; {remedy}")
 
 
-OF_LEADERS = ("algorithm1", "equivalent", "ignore")
-"""Policies of late data that only the kind `leader` has."""
-
-
 class ThenPart(Part):
     """Another policy from `at_s` after the start on."""
 
@@ -165,28 +161,6 @@ class LatenessPart(Part):
             odometry_wait_ns=nanoseconds(self.odometry_wait_s),
             clock_sigma_ns=nanoseconds(self.clock_sigma_s),
         )
-
-    def check(self, localization: LocalizationPart, model: str) -> None:
-        """Raises `ConfigError` for a policy that a kind of localization does not have, and for a clock that nobody says
-        anything about."""
-        if localization.kind == "leader":
-            if model != "unicycle":
-                raise ConfigError(f"kind = 'leader' is of robots on the ground, not of '{model}'; take model = 'unicycle'")
-            if localization.clock_state and self.clock_sigma_s == 0.0:
-                raise ConfigError(
-                    "clock_state = true needs lateness.clock_sigma_s above 0: how well clocks agree by themselves"
-                )
-            return
-        kinds = [self.kind] if self.then is None else [self.kind, self.then.kind]
-        other = next((kind for kind in kinds if kind in OF_LEADERS), None)
-        if other is not None:
-            raise ConfigError(
-                f"lateness.kind = '{other}' is of kind 'leader' alone: elsewhere it would count what is late twice, or as "
-                "of another instant; take 'compensate', 'replay' or 'discard'"
-            )
-        for key in ("iterations", "then"):
-            if getattr(self, key) is not None:
-                raise ConfigError(f"lateness.{key} is of kind 'leader', not of '{localization.kind}'; leave it out")
 
 
 class HealthPart(Part):

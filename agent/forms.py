@@ -31,8 +31,9 @@ def build_filter(
 ) -> CooperativeFilter:
     """The filter of `settings.localization`; of a robot that does not know where it is, one that waits for it.
 
-    Who follows a leader trusts it. Who tracks by bearings of many has one that knows no targets, and a triangulator beside it. `saved`: what it begins
-    with, which is of the form of the settings (`agent.saved_state.decode`). The kind `replica` judges no peer.
+    Who tracks by bearings of many has one that knows no targets, and a triangulator beside it. `saved`: what it begins
+    with, which is of the form of the settings (`agent.saved_state.decode`). The kinds `replica` and `leader` judge no
+    peer.
     """
     if settings.tracking.kind == "own" or not settings.track:
         return _localizing(settings, counters, count_nis, health, saved)

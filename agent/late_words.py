@@ -1,8 +1,8 @@
 """What a follower does with a measurement of its leader that is complete only when the state has moved on.
 
-`replay` is none of its business: the core leads the filter back then (`agent.replay`). The policies are those of Zhang &
-Cao 2019, whose kernels are in `agent.estimation.delayed`, and two that everybody has at hand: `ignore`, which takes what
-comes late as if of now, and `discard`. A measurement is dealt with by the policy that was on when it was made.
+`replay` is none of its business: the core leads the filter back then (`agent.replay`). The policies are those of Zhang
+& Cao 2019, whose kernels are in `agent.estimation.delayed`, and two that everybody has at hand: `ignore`, which takes
+what comes late as if of now, and `discard`. A measurement is dealt with by the policy that was on when it was made.
 """
 
 from __future__ import annotations

@@ -1,11 +1,12 @@
 """A robot that localizes by its leader, or is the leader (kind `leader`; Zhang & Cao 2019).
 
-The follower measures range and bearing of the leader, and the leader tells where it was: to everybody at each instant of
-a round, or to who asks (the paper's figure 1). What the word completes is an own datum of the instant of the measurement,
-handed to the core (`completed`), which puts it in its place (`lateness.kind = "replay"`) or hands it over as late.
+The follower measures range and bearing of the leader, and the leader tells where it was: to everybody at each instant
+of a round, or to who asks (the paper's figure 1). What the word completes is an own datum of the instant of the
+measurement, handed to the core (`completed`), which puts it in its place (`lateness.kind = "replay"`) or hands it over
+as late.
 
-Nobody is told what the follower believes, and the leader does not use its followers: nothing is shared, and a follower may
-make its belief anew as far back as it likes. The leader is trusted.
+Nobody is told what the follower believes, and the leader does not use its followers: nothing is shared, and a follower
+may make its belief anew as far back as it likes. The leader is trusted.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ class LeaderFilter:
         return Estimate(own.t_ns, self._settings.layout.name, own.mean[:POSE], own.cov[:POSE, :POSE], ())
 
     def clock(self) -> tuple[float, float] | None:
-        """By how much the leader's clock is ahead beyond what is known of it, and its deviation [s]; None: not asked."""
+        """By how much the leader's clock is ahead beyond what is known, and its deviation [s]; None: not asked."""
         own = self._own.newest
         return (float(own.mean[POSE]), float(own.cov[POSE, POSE]) ** 0.5) if self._clock_sigma_s > 0.0 else None
 
@@ -291,7 +292,7 @@ class LeaderFilter:
         self._counters["pair.other_form"] += 1
 
     def _offset(self, event: Received) -> int:
-        """The leader's clock minus the own one. Whose remaining error is estimated is held, so that it is one number."""
+        """The leader's clock minus the own one. If what is left of it is estimated, it is held."""
         offset_ns = self._clocks.offset_ns(event)
         if self._clock_sigma_s == 0.0:
             return offset_ns

@@ -1,8 +1,8 @@
 """A leader's words as its followers keep them, and the measurements of the leader that wait for one.
 
-A measurement of the instant s is completed by a word about s. A leader that tells everybody may do so at other instants:
-then by the two words around s, if one came right before the other, so that which words complete it does not depend on
-the order they arrive in. The place between them is on the straight line; how far off that may be follows from
+A measurement of the instant s is completed by a word about s. A leader that tells everybody may do so at other
+instants: then by the two words around s, if one came right before the other, so that which words complete it does not
+depend on the order they arrive in. The place between them is on the straight line; how far off that may be follows from
 how the leader's velocity changed.
 """
 

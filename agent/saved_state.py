@@ -4,7 +4,7 @@ Who keeps correlation factors (`safe`, `published`, `joint`) goes on with them. 
 the last message of a contact: what peers have been told is in them as lines and bases then, and what was learnt since
 is forgotten by one side only, as if a reply had been lost (`agent.pairing`). The shell writes before it sends.
 
-Who keeps none (`split_joint`, `auto`, the kinds `jlatt`, `leader` and `fixed`) begins with its belief, all of which counts as
+Who keeps none (`split_joint`, `auto`, kinds `jlatt`, `leader`, `fixed`) begins with its belief, all of which counts as
 shared, correlated with everybody's in an unknown way. That holds however old the bytes are and whatever was said since.
 
 Either way the state is of its instant, and the robot coasts from there: it does not know how it moved meanwhile.

@@ -15,6 +15,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,7 +115,7 @@ def story(
         (poses[index + 1, :2] - poses[index, :2]) / DT,
         np.broadcast_to(np.arange(STEPS + 1) % every == 0, late.shape),
         np.where(came, late, -1),
-        DT * off,
+        np.asarray(DT * off, dtype=np.float64),
     )
 
 
@@ -170,7 +171,8 @@ class Follower:
         self._past.append((self.mean, self.cov))
         measured = found.measured[:, k]
         if policy == "nodelay":
-            self._take(corrected(self.mean, self.cov, self.sight(k), self._iterations), measured & (found.delay[:, k] >= 0))
+            came = measured & (found.delay[:, k] >= 0)
+            self._take(corrected(self.mean, self.cov, self.sight(k), self._iterations), came)
             return
         if measured.any() and policy in ("compensate", "anticipate", "algorithm1", "equivalent"):
             flight = begun(self.mean, self.cov)
@@ -280,14 +282,15 @@ def delays_table(trials: int, seed: int) -> str:
 def exchanges_table(trials: int, seed: int) -> str:
     rows = []
     shown = [policy for policy in POLICIES if policy != "nodelay"]
-    stories = [
-        (f"request, {n} periods, loss {loss:g}", {"delay": n, "loss": loss, "every": n}) for n, loss in REQUESTS
+    stories: list[tuple[str, dict[str, Any]]] = [
+        (f"request, {n} periods, loss {loss:g}", {"delay": n, "loss": loss, "every": n + 1})
+        for n, loss in REQUESTS
     ]
     for n, loss in VARIABLE:
         drawn = np.random.default_rng(seed + 1).integers(0, n + 1, (trials, STEPS + 1))
         stories.append((f"0 to {n} periods, loss {loss:g}", {"delay": drawn, "loss": loss}))
     for name, what in stories:
-        found = story(trials, np.random.default_rng(seed), **what)  # type: ignore[arg-type]
+        found = story(trials, np.random.default_rng(seed), **what)
         cells = [play(found, seed, policy) for policy in shown]
         rows.append([name, *cells, play(found, seed, "replay", iterations=2)])
     heads = ["case", *shown, "replay, 2 iterations"]
@@ -343,7 +346,7 @@ OF_SCENARIOS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 
 def scenarios_table(trials: int, seed: int, jobs: int, out: Path) -> str:
     """Figures of the follower. Raises `RuntimeError` if a command fails."""
-    rows = []
+    rows: list[list[object]] = []
     for name, scenario, changes in OF_SCENARIOS:
         where = out / f"{scenario}-{len(rows)}-{trials}-{seed}"
         command = ["montecarlo", scenario, "--trials", str(trials), "--seed", str(seed), "--jobs", str(jobs)]

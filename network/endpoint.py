@@ -400,7 +400,9 @@ def _belongs(body: Body, channel: str) -> bool:
     """Whether a body of this type may travel on this channel."""
     if isinstance(body, Hello):
         return channel == Channel.HELLO
-    if isinstance(body, LifeNotice | PairRequest | PairReply | SplitRequest | SplitReply | StartRequest | LeaderRequest):
+    if isinstance(body, LifeNotice | PairRequest | PairReply | SplitRequest | SplitReply | StartRequest):
+        return channel == Channel.PAIR
+    if isinstance(body, LeaderRequest):
         return channel == Channel.PAIR
     if isinstance(body, LeaderReport) and body.answers is not None:
         return channel == Channel.PAIR

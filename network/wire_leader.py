@@ -1,4 +1,4 @@
-"""Wire format of a leader's word: a request is `[number]`, a report `[place, cov, velocity, before or nil, answers or nil]`."""
+"""Wire format of a leader's word: `[number]`, and `[place, cov, velocity, before or nil, answers or nil]`."""
 
 from __future__ import annotations
 

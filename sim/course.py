@@ -1,5 +1,5 @@
-"""Courses that targets, and robots on the ground, follow whatever happens: pieces of constant turn rate about the vertical, turns on the spot, and
-flight at random (`sim.wander`).
+"""Courses that targets, and robots on the ground, follow whatever happens: pieces of constant turn rate about the
+vertical, turns on the spot, and flight at random (`sim.wander`).
 
 The velocity at instant k is the one that carried the target from instant k - 1 to k, so p(k) = p(k - 1) + dt v(k).
 """
@@ -7,10 +7,11 @@ The velocity at instant k is the one that carried the target from instant k - 1 
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from agent.config_file import ConfigError, Finite, Part, Positive, Vector3
 from agent.estimation.gaussian import wrap
@@ -27,6 +28,19 @@ class PiecePart(Part):
     for_s: Positive
     turn_radps: Finite = 0.0
     turn_rad: Finite = 0.0
+
+
+class BendPart(Part):
+    """For `for_s` the heading turns at `turn_radps`, to the left if that is positive."""
+
+    for_s: Positive
+    turn_radps: Finite = 0.0
+
+
+class DrivePart(Part):
+    """What a robot on the ground drives again and again, at its commanded speed."""
+
+    pieces: Annotated[list[BendPart], Field(min_length=1)]
 
 
 KEYS: dict[str, tuple[str, ...]] = {
@@ -85,11 +99,6 @@ class CoursePart(Part):
             if key != "kind" and key not in KEYS[self.kind] and getattr(self, key) != field.default:
                 raise ConfigError(f"course.{key} is not of kind '{self.kind}'; leave it out")
         layout = LAYOUTS[model]
-        if model == "unicycle" and self.kind in ("circle", "pieces"):
-            self.stretches()
-            if any(piece.turn_rad for piece in self.stretches()):
-                raise ConfigError("course.pieces: a robot on the ground turns on its way; leave turn_rad out")
-            return
         if layout.heading is not None or layout.dim != 2 * len(layout.position):
             raise ConfigError(
                 f"course: the model '{model}' does not move by a velocity alone; take 'constant_velocity_3d' or "
@@ -132,10 +141,11 @@ def followed(
     return track
 
 
-def driven_along(course: CoursePart, start: Array, speed_mps: float, step_ns: int, steps: int) -> tuple[Array, Array]:
+def driven_along(course: DrivePart, start: Array, speed_mps: float, step_ns: int, steps: int) -> tuple[Array, Array]:
     """True poses (steps + 1, 3) on the ground at a constant speed, and what a perfect odometry says of each step
     (steps, 3): straight on, and then the turn."""
-    turned = _turned(course.stretches(), step_ns, steps)
+    pieces = [PiecePart(for_s=piece.for_s, turn_radps=piece.turn_radps) for piece in course.pieces]
+    turned = _turned(pieces, step_ns, steps)
     heading = start[2] + turned
     way = speed_mps * step_ns * 1e-9
     track = np.zeros((steps + 1, 3))

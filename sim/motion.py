@@ -28,7 +28,7 @@ def driven(scenario: Scenario, mover: RobotPart | TargetPart, start: Array, seed
         if mover.course is not None:
             return followed(mover.course, layout, start, nanoseconds(scenario.step_s), steps, seed, mover.id)
         return _drifted(scenario, mover, layout, start, seed, steps)
-    if mover.course is not None:
+    if isinstance(mover, RobotPart) and mover.course is not None:
         return driven_along(mover.course, start, mover.control.speed_mps, nanoseconds(scenario.step_s), steps)[0]
     dt = scenario.step_s
     noise = normal_rows(seed, steps, 2, mover.id, "control")

@@ -47,7 +47,7 @@ from agent.settings import nanoseconds
 from agent.start_config import StartSource
 from agent.target_parts import TargetModel, TrackingPart, target_motion
 from agent.unsafe_parts import UnsafePart
-from sim.course import CoursePart
+from sim.course import CoursePart, DrivePart
 from sim.directions import DirectionNoise
 
 Subject = Literal["peers", "landmarks", "targets"]
@@ -203,7 +203,7 @@ class RobotPart(Part):
     start: StartPart = StartPart()
     start_sigma: SigmaPart
     start_source: StartSource = "survey"
-    course: CoursePart | None = None
+    course: DrivePart | None = None
     control: ControlPart = ControlPart()
     noise: ControlNoisePart = ControlNoisePart()
     odometry: OdometryPart | None = None

@@ -11,6 +11,7 @@ from agent.estimation.mounting import mount_of
 from agent.estimation.observation import RELATIVE_ANGLES
 from agent.fault_parts import AnyFaultPart, SensorDelayPart, SensorFaultPart, check_faults, named
 from agent.joint_room import check_room
+from agent.leader_parts import check_lateness
 from agent.motion_parts import ControlPart
 from agent.start_config import check_start
 from sim.scenario import (
@@ -86,7 +87,7 @@ def check(scenario: Scenario) -> None:
         localization, tracking = scenario.localization_of(robot), scenario.tracking_of(robot)
         try:
             localization.settings()
-            scenario.lateness_of(robot).check(localization, robot.model)
+            check_lateness(scenario.lateness_of(robot), localization, robot.model)
             tracking.check_kind(localization, [target.id for target in scenario.targets if not target.prior])
             tracking.check_targets([(target.id, target.model) for target in scenario.targets])
             if localization.form == "joint":
@@ -168,7 +169,7 @@ def _check_team(scenario: Scenario) -> None:
     for robot in scenario.robots:
         leader = scenario.localization_of(robot).leader
         if kinds[robot.id] == "leader" and leader is not None and kinds.get(leader) != "leader":
-            there = f"has localization.kind = '{kinds[leader]}', and answers nobody" if leader in kinds else "is not there"
+            there = f"is of kind '{kinds[leader]}', and answers nobody" if leader in kinds else "is not there"
             raise ConfigError(
                 f"{scenario.name}: robots.{robot.id}.localization.leader = '{leader}' {there}; take a robot of "
                 "kind 'leader'"
@@ -269,15 +270,9 @@ def _check_driven(where: str, robot: RobotPart, led: bool) -> None:
     if robot.course is None:
         return
     if led or robot.model != "unicycle" or robot.planning.get("kind", "none") != "none":
-        raise ConfigError(f"{where}.course is of a 'unicycle' in a simulated world that nothing else moves; leave it out")
-    if robot.course.kind not in ("circle", "pieces"):
-        raise ConfigError(f"{where}.course.kind = '{robot.course.kind}' is of targets; take 'pieces' or 'circle'")
+        raise ConfigError(f"{where}.course is of a 'unicycle' in a simulated world, moved by nothing else; leave it")
     if robot.control.yaw_rate_radps:
         raise ConfigError(f"{where}.control.yaw_rate_radps is not used with a course; leave it out")
-    try:
-        robot.course.check(robot.model)
-    except ConfigError as error:
-        raise ConfigError(f"{where}.{error}") from None
 
 
 def _check_course(where: str, target: TargetPart) -> None:

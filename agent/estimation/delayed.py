@@ -1,8 +1,9 @@
 """A follower localizes by range and bearing of its leader, whose word about where it was comes late.
 
-The filter is the EKF of Zhang & Cao, "Delayed cooperative localization with communication delays" (Information 2019), with what is
-misprinted there put right. s is the instant of a measurement, k > s that at which the leader's word about it arrives.
-The state is x, y, heading of the follower, and perhaps tau [s], by which the leader's clock is ahead unknown to anybody.
+The filter is the EKF of Zhang & Cao, "Delayed cooperative localization with communication delays" (Information 2019),
+with what is misprinted there put right. s is the instant of a measurement, k > s that at which the leader's word about
+it arrives. The state is x, y, heading of the follower, and perhaps tau [s], by which the leader's clock is ahead without
+anybody knowing.
 
 What the paper has in its state, the leader's place l(s), is a delivered constant: it enters by its covariance Pl, as
 R + Cl Pl Cl^T, which is the paper's update with l(s) marginalized, as long as its error is a new one in each word. What
@@ -77,7 +78,7 @@ def moved(mean: Array, cov: Array, delta: Array, noise: Array) -> tuple[Array, A
 
 
 def predicted(state: Array, place: Array, sight: LeaderSight) -> tuple[Array, Array, Array]:
-    """h (..., 2) of a state (..., n) and a leader at `place` (..., 2), and its Jacobians Cf (..., 2, n), Cl (..., 2, 2).
+    """h (..., 2) of a state (..., n) and a leader at `place` (..., 2), with Jacobians Cf (..., 2, n), Cl (..., 2, 2).
 
     h = (|l - q|, atan2(l - q) - heading - yaw), q the sensor's place.
     """

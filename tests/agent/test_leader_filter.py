@@ -162,7 +162,7 @@ def test_each_policy_says_what_it_did(kind: str, counter: str) -> None:
 
 
 def test_compensating_shrinks_the_covariance_before_the_word_is_there() -> None:
-    events = own(10) + [word(1, 2)]
+    events = [*own(10), word(1, 2)]
     waiting, certain = play(robot(kind="equivalent"), events, 10), play(robot(kind="compensate"), events, 10)
     assert np.trace(certain.cov) < np.trace(waiting.cov)
 
@@ -296,7 +296,7 @@ def test_a_leader_that_trusts_its_fixes_tells_them_as_they_are() -> None:
 
 
 def test_followers_are_told_in_time_before_and_after_a_late_fix() -> None:
-    agent, reports = led("fused")
+    agent, _ = led("fused")
     t_ns = 10 * STEP_NS
     agent.handle(Fix(t_ns, 5 * STEP_NS, "position", np.array([3.5, 0.0]), 0.01 * np.eye(2), "gps2"))
     agent.handle(moves(11, 0.0))

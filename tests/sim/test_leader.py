@@ -159,7 +159,7 @@ def test_delays_that_spread_do_so_evenly() -> None:
         ("leader-follower", ["localization.weights=info"], ["has no rounds"]),
         ("leader-follower", ["tracking.kind=stt"], ["tracks nothing"]),
         ("leader-follower", ["robots.r2.model=unicycle_gains", GAINS], ["unicycle"]),
-        ("leader-follower", ["robots.r2.course.kind=square"], ["'square' is of targets"]),
+        ("leader-follower", ["robots.r2.course.pieces=[]"], ["robots.r2.course.pieces"]),
         ("leader-follower", ["robots.r2.control.yaw_rate_radps=0.1"], ["not used with a course"]),
         ("demo", ["lateness.kind=algorithm1"], ["of kind 'leader' alone", "'replay'"]),
         ("demo", ["lateness.kind=equivalent"], ["of kind 'leader' alone"]),

@@ -124,8 +124,9 @@ def test_algorithm_1_as_printed_uses_a_measurement_twice_even_without_delay() ->
 
 
 def late(steps: int) -> tuple[Array, Array, Array, Array, LeaderSight, list[Array]]:
-    """A sight at a straight way's beginning, which is not far from linear: its belief, that `steps` later, the sight."""
-    mean, seen = np.zeros(3), LeaderSight(np.array([3.0005, 0.0001]), R, np.array([3.0, 0.0]), 0.01 * np.eye(2), np.zeros(2))
+    """A sight at a straight way's beginning, which is nearly linear: its belief, that `steps` later, the sight."""
+    mean, place = np.zeros(3), np.array([3.0, 0.0])
+    seen = LeaderSight(np.array([3.0005, 0.0001]), R, place, 0.01 * np.eye(2), np.zeros(2))
     steps_of = [STRAIGHT] * steps
     now, cov = mean, COV
     for delta in steps_of:
