@@ -7,11 +7,10 @@ The velocity at instant k is the one that carried the target from instant k - 1 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from agent.config_file import ConfigError, Finite, Part, Positive, Vector3
 from agent.estimation.gaussian import wrap
@@ -40,7 +39,7 @@ class BendPart(Part):
 class DrivePart(Part):
     """What a robot on the ground drives again and again, at its commanded speed."""
 
-    pieces: Annotated[list[BendPart], Field(min_length=1)]
+    pieces: list[BendPart]
 
 
 KEYS: dict[str, tuple[str, ...]] = {

@@ -271,6 +271,8 @@ def _check_driven(where: str, robot: RobotPart, led: bool) -> None:
         return
     if led or robot.model != "unicycle" or robot.planning.get("kind", "none") != "none":
         raise ConfigError(f"{where}.course is of a 'unicycle' in a simulated world, moved by nothing else; leave it")
+    if not robot.course.pieces:
+        raise ConfigError(f"{where}.course.pieces is empty; state at least one, for instance {{ for_s = 5.0 }}")
     if robot.control.yaw_rate_radps:
         raise ConfigError(f"{where}.control.yaw_rate_radps is not used with a course; leave it out")
 

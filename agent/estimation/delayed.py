@@ -1,8 +1,8 @@
 """A follower localizes by range and bearing of its leader, whose word about where it was comes late.
 
 The filter is the EKF of Zhang & Cao, "Delayed cooperative localization with communication delays" (Information 2019),
-with what is misprinted there put right. s is the instant of a measurement, k > s that at which the leader's word about
-it arrives. The state is x, y, heading of the follower, and perhaps tau [s], by which the leader's clock is ahead without
+with what is misprinted there put right. s is the instant of a measurement, k > s that at which the leader's word on it
+arrives. The state is x, y, heading of the follower, and perhaps tau [s], by which the leader's clock is ahead without
 anybody knowing.
 
 What the paper has in its state, the leader's place l(s), is a delivered constant: it enters by its covariance Pl, as
