@@ -89,12 +89,12 @@ class Agent:
         """Take one event; returns the effects to be carried out, in order."""
         self.now_ns = max(self.now_ns, event.t_ns)
         effects: list[Effect] = []
-        if self._replays != self._replaying():
-            # What was used by another policy is not in the log.
-            self._rewind()
-            self._replays = self._replaying()
-            self._commit()
         try:
+            if self._replays != self._replaying():
+                # What another policy has used is not in the log.
+                self._drain(effects)
+                self._replays = self._replaying()
+                self._commit()
             self._take(event, effects)
         except np.linalg.LinAlgError:
             self.counters["update.failed"] += 1
@@ -390,7 +390,7 @@ class Agent:
             with self._told(effects):
                 self._instant().process(item, effects)
             self._complete()
-        elif self._log is None or not self._replays:
+        elif self._log is None:
             self._instant().process(item, effects)
         else:
             late = item.t_ns < self.filter.t_ns - self.settings.lateness.tolerance_ns

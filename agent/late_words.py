@@ -32,6 +32,7 @@ from agent.settings import LatenessSettings
 Array = NDArray[np.float64]
 
 Key = tuple[int, bytes]
+UnderWay = dict[Key, InFlight]
 
 MAX_FLIGHTS = 256
 
@@ -41,7 +42,7 @@ class LateWords:
 
     def __init__(self, lateness: LatenessSettings, start_ns: int, course: Course, counters: Counter[str]) -> None:
         self._lateness, self._start_ns, self._course, self._counters = lateness, start_ns, course, counters
-        self._flights: dict[Key, InFlight] = {}
+        self._flights: UnderWay = {}
         self._fresh: dict[Key, LeaderSight] = {}
 
     def sizes(self) -> dict[str, tuple[int, int]]:
@@ -54,16 +55,25 @@ class LateWords:
 
     # -- while the leader's word is on its way ----------------------------------------------------------------
 
-    def measured(self, t_ns: int, sight: LeaderSight) -> None:
-        """The leader is measured at the present instant; `sight` has no place yet, and the covariance expected."""
+    def under_way(self) -> UnderWay:
+        """What a rewind to the present instant needs."""
+        return dict(self._flights)
+
+    def restore(self, found: UnderWay) -> None:
+        """Return to what was under way."""
+        self._flights = dict(found)
+
+    def measured(self, t_ns: int, z: Array, sight: LeaderSight | None) -> None:
+        """The leader is measured at the present instant: z (2,). `sight` has no place yet, and the covariance that is
+        expected of its word; None: there was no word yet, so that nothing can be expected."""
         if self.policy(t_ns) not in ("compensate", "algorithm1", "equivalent"):
             return
         if len(self._flights) >= MAX_FLIGHTS:
             self._counters["leader.too_many"] += 1
             return
-        now, key = self._course.newest, _key(t_ns, sight.z)
+        now, key = self._course.newest, _key(t_ns, z)
         self._flights[key] = begun(now.mean, now.cov)
-        if self.policy(t_ns) == "compensate":
+        if self.policy(t_ns) == "compensate" and sight is not None:
             self._fresh[key] = sight
 
     def leave(self) -> None:

@@ -30,7 +30,7 @@ from agent.estimation.split_joint import Split
 from agent.estimation.unscented import Propagated
 from agent.events import Completed, LinkChange, Observation, Received
 from agent.joint_tracks import JointState
-from agent.late_words import LateWords
+from agent.late_words import LateWords, UnderWay
 from agent.leader_voice import LeaderVoice
 from agent.leader_words import LeaderWords, Word
 from agent.pair_clock import PairClocks
@@ -119,10 +119,12 @@ class LeaderFilter:
         return SavedSplit(JointState(own.t_ns, mean, Split(np.zeros_like(cov), cov), (), (), {}))
 
     def mark(self) -> FilterMark:
-        return FilterMark(self, self._own.mark())
+        return FilterMark(self, (self._own.mark(), self._late.under_way()))
 
     def rewind(self, mark: FilterMark) -> None:
-        self._own.rewind(cast("CourseMark", mark.kept))
+        course, flights = cast("tuple[CourseMark, UnderWay]", mark.kept)
+        self._own.rewind(course)
+        self._late.restore(flights)
         self._revision = object()
 
     # -- own information ------------------------------------------------------------------------------------
@@ -196,11 +198,11 @@ class LeaderFilter:
             done = self._words.measured(t_ns, usable)
         self._counters["leader.measured"] += len(usable)
         self._done += done
-        expected = self._words.newest_cov()
         if abs(t_ns - self.t_ns) <= self._settings.lateness.tolerance_ns and not done:
-            told = 0.01 * np.eye(2) if expected is None else expected
+            expected = self._words.expected_cov()
             for item in usable:
-                self._late.measured(t_ns, _sight(item, np.zeros(2), told, np.zeros(2)))
+                sight = None if expected is None else _sight(item, np.zeros(2), expected, np.zeros(2))
+                self._late.measured(t_ns, item.z, sight)
 
     def heard(self, event: Received, effects: list[Effect]) -> None:
         header, body = event.message.header, event.message.body

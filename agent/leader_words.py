@@ -74,6 +74,8 @@ class LeaderWords:
         self._words: list[Word] = []
         self._waiting: dict[int, Waiting] = {}
         self._last_ns: int | None = None
+        self._since_ns: int | None = None
+        self._cov: Array | None = None
         self._asked: dict[int, tuple[Waiting, int]] = {}
         self._count = 0
 
@@ -87,6 +89,7 @@ class LeaderWords:
     def _measured(self, t_ns: int, measurements: tuple[Measurement, ...]) -> Waiting:
         apart = None if self._last_ns is None else abs(t_ns - self._last_ns)
         self._last_ns = t_ns if self._last_ns is None else max(t_ns, self._last_ns)
+        self._since_ns = apart
         return Waiting(t_ns, measurements, apart)
 
     # -- of a leader that tells everybody -------------------------------------------------------------------
@@ -139,14 +142,18 @@ class LeaderWords:
     def _completed(self, waiting: Waiting, word: Word, gap_ns: int) -> list[Completed]:
         """An error that lasts over several measurements counts in each as so much larger that it adds up to the same:
         a word that is used again because words are rarer than measurements, and what the leader's own filter is off."""
-        lasts_ns = max(gap_ns, self._settings.localization.leader_correlation_ns)
-        scale = 1.0 if waiting.since_ns is None else max(1.0, lasts_ns / max(waiting.since_ns, 1))
+        self._cov = word.cov
+        scale = self._scale(waiting.since_ns, gap_ns)
         return [
             Completed(
                 waiting.t_ns, item.kind, item.z, item.R, word.place, scale * word.cov, word.velocity, item.mount
             )
             for item in waiting.measurements
         ]
+
+    def _scale(self, since_ns: int | None, gap_ns: int = 0) -> float:
+        lasts_ns = max(gap_ns, self._settings.localization.leader_correlation_ns)
+        return 1.0 if since_ns is None else max(1.0, lasts_ns / max(since_ns, 1))
 
     # -- of a leader that is asked --------------------------------------------------------------------------
 
@@ -192,9 +199,10 @@ class LeaderWords:
         """The leader has begun a new life: its words are of another chain, and its clock is another one."""
         self._words.clear()
 
-    def newest_cov(self) -> Array | None:
-        """The covariance (2, 2) that a word last had."""
-        return self._words[-1].cov if self._words else None
+    def expected_cov(self) -> Array | None:
+        """The covariance (2, 2) that the word about the last measurement will count with, by the words before; None:
+        there was none yet."""
+        return None if self._cov is None else self._scale(self._since_ns) * self._cov
 
 
 def _stamp(word: Word) -> int:

@@ -366,3 +366,27 @@ def test_what_keeps_data_is_bounded() -> None:
     play(agent, own(400) + [word(k, k) for k in range(1, 400, 7)], 400)
     assert all(size <= bound for size, bound in agent.sizes().values())
     assert agent.sizes()["leader.waiting"][0] < 60
+
+
+def test_what_was_compensated_under_way_survives_a_change_to_replay() -> None:
+    """Words under way when `replay` begins belong to measurements that the covariance has taken already."""
+    agent = robot(kind="compensate", then=(2 * NS, "replay"))
+    play(agent, own() + [word(k, k + 5) for k in range(1, 35)])
+    assert agent.counters["used.leader"] == 34
+    assert agent.counters["late.replayed"] >= 10
+    assert all(size <= bound for size, bound in agent.sizes().values())
+    assert agent.sizes()["leader.flights"][0] == 0
+
+
+def test_without_a_word_before_nothing_is_anticipated() -> None:
+    agent = robot(kind="compensate")
+    play(agent, own(10), 10)
+    assert agent.counters["leader.anticipated"] == 0
+    play(agent, [word(1, 11), *[moves(k) for k in range(11, 13)], replace(sees(12), t_ns=12 * STEP_NS), moves(13)], 13)
+    assert agent.counters["leader.anticipated"] == 1
+
+
+def test_words_that_never_come_are_told_of_where_the_covariance_has_shrunk_for_them() -> None:
+    agent = robot(kind="compensate", horizon_ns=NS)
+    play(agent, [*own(), word(1, 2)])
+    assert agent.counters["leader.shrunk_for_nothing"] > 20
