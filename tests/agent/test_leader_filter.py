@@ -219,6 +219,8 @@ def test_an_answer_that_is_lost_is_given_up() -> None:
     assert agent.counters["leader.given_up"] == 1
     agent.handle(word(1, 30.5, number=1))
     assert agent.counters["used.leader"] == 1, "late is better than never"
+    # The second request has told nobody anything: the robot goes back to before it.
+    assert (agent.counters["late.replayed"], agent.counters["late.compensated"]) == (1, 0)
     agent.handle(word(1, 30.6, number=1))
     assert agent.counters["leader.unasked"] == 1
 
@@ -376,6 +378,16 @@ def test_what_was_compensated_under_way_survives_a_change_to_replay() -> None:
     assert agent.counters["late.replayed"] >= 10
     assert all(size <= bound for size, bound in agent.sizes().values())
     assert agent.sizes()["leader.flights"][0] == 0
+
+
+def test_a_rewind_leads_what_is_under_way_through_the_same_stretch_once() -> None:
+    before: list[Event] = [*own(25), *[word(k, k + 2) for k in range(1, 18)], word(18, 24.5)]
+    in_time, late = robot(kind="compensate", then=(2 * NS, "replay")), robot(kind="compensate", then=(2 * NS, "replay"))
+    first = play(in_time, [*before, word(22, 22)], 25)
+    second = play(late, [*before, word(22, 23.5)], 25)
+    assert late.counters["late.replayed"] == 1
+    assert second.mean == pytest.approx(first.mean, abs=1e-12)
+    assert second.cov == pytest.approx(first.cov, abs=1e-12)
 
 
 def test_without_a_word_before_nothing_is_anticipated() -> None:

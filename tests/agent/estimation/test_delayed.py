@@ -33,6 +33,7 @@ R = np.diag([0.25, np.radians(0.5) ** 2])
 COV = np.diag([0.09, 0.09, np.radians(5.0) ** 2])
 NOISE = np.diag([1e-4, 0.0, np.radians(0.3) ** 2])
 STRAIGHT = np.array([0.1, 0.0, 0.0])
+BEND = np.array([0.1, 0.02, 0.05])
 SEEDS = st.integers(0, 2**32 - 1)
 TRIALS = sized(60, 200)
 
@@ -124,10 +125,10 @@ def test_algorithm_1_as_printed_uses_a_measurement_twice_even_without_delay() ->
 
 
 def late(steps: int) -> tuple[Array, Array, Array, Array, LeaderSight, list[Array]]:
-    """A sight at a straight way's beginning, which is nearly linear: its belief, that `steps` later, the sight."""
-    mean, place = np.zeros(3), np.array([3.0, 0.0])
+    """A sight that fits what is believed, so that all is nearly linear: the belief then, and `steps` later."""
+    mean, place = np.array([0.0, 0.0, 0.6]), 3.0 * np.array([np.cos(0.6), np.sin(0.6)])
     seen = LeaderSight(np.array([3.0005, 0.0001]), R, place, 0.01 * np.eye(2), np.zeros(2))
-    steps_of = [STRAIGHT] * steps
+    steps_of = [BEND] * steps
     now, cov = mean, COV
     for delta in steps_of:
         now, cov, _ = moved(now, cov, delta, NOISE)
@@ -138,10 +139,10 @@ def test_one_in_flight_is_compensated_as_by_a_replay() -> None:
     mean, cov, late_mean, _, seen, steps = late(8)
     there = corrected(mean, cov, seen)
     flight = replace(begun(mean, cov), gain=there.gain)
-    replayed, replayed_cov, shrunk = there.mean, there.cov, there.cov
+    replayed, replayed_cov, shrunk, way = there.mean, there.cov, there.cov, mean
     for delta in steps:
         replayed, replayed_cov, _ = moved(replayed, replayed_cov, delta, NOISE)
-        _, shrunk, F = moved(mean, shrunk, delta, NOISE)
+        way, shrunk, F = moved(way, shrunk, delta, NOISE)
         flight = flight.moved(F, delta)
     assert compensated(late_mean, flight, seen) == pytest.approx(replayed, abs=1e-6)
     assert shrunk == pytest.approx(replayed_cov, abs=1e-5)
