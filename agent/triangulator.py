@@ -27,7 +27,8 @@ from agent.plausible import FARTHEST
 from agent.rounds import Told as Heard
 from agent.settings import AgentSettings, TargetSettings
 from agent.tracks import track_ended
-from network.messages import Bearing, BearingReport, Prediction
+from network.messages import MAX_MESSAGE_BYTES, Bearing, BearingReport, Prediction
+from network.wire import size_bound
 
 Array = NDArray[np.float64]
 
@@ -56,6 +57,11 @@ class _Track:
     crossed_ns: int | None = None
 
 
+def _only(report: BearingReport, targets: set[str]) -> BearingReport:
+    bearings = tuple(item for item in report.bearings if item.target in targets)
+    return BearingReport(bearings, tuple(item for item in report.predictions if item.target in targets))
+
+
 class Triangulator:
     """The tracks of one robot whose `tracking.kind` is that of a bearing filter."""
 
@@ -69,6 +75,7 @@ class Triangulator:
         self._tracks: dict[str, _Track] = {}
         self._seen: dict[str, tuple[int, Directed]] = {}
         self._used: dict[str, int] = {}
+        self._told_ns: dict[str, int] = {}
 
     def _options(self, target: TargetSettings) -> dict[str, float]:
         """What the settings say to a filter of the kind."""
@@ -108,7 +115,19 @@ class Triangulator:
             if track is not None and kind.tells_mean:
                 told = kind.predicted(track.state, (t_ns - track.t_ns) * 1e-9, self._own(target, t_ns))
                 predictions.append(Prediction(target, told.mean, told.cov if kind.tells_cov else None))
-        return BearingReport(tuple(bearings), tuple(predictions))
+        return self._fitting(t_ns, BearingReport(tuple(bearings), tuple(predictions)))
+
+    def _fitting(self, t_ns: int, report: BearingReport) -> BearingReport:
+        """What fits into one message; who was told of longest ago comes first, so that all are told in turn."""
+        known = {item.target for item in (*report.bearings, *report.predictions)}
+        chosen: set[str] = set()
+        for target in sorted(known, key=lambda name: (self._told_ns.get(name, -1), name)):
+            if size_bound(_only(report, chosen | {target})) <= MAX_MESSAGE_BYTES:
+                chosen.add(target)
+                self._told_ns[target] = t_ns
+            else:
+                self._counters["round.left_out"] += 1
+        return _only(report, chosen)
 
     def _own(self, target: str, t_ns: int) -> list[Sight]:
         seen = self._seen.get(target)

@@ -9,7 +9,8 @@ Against the published ones (`agent.estimation.triangulation`):
    the observers; but it converges from anywhere, and is taken elsewhere.
 3. The covariance is that of a target with white acceleration of density q, which forgetting only imitates.
 4. Directions far off the prediction, on the scale of its own spread, count less, but never nothing: a robot that has
-   lost the target can find it again. Where directions cross and all are far off, the prediction is what is doubted.
+   lost the target can find it again. Where directions cross and all are far off, the prediction is what is doubted,
+   and they are weighed again by how near they pass to where they come to.
 5. Late directions are used at their own instant, q tau^3 / 3 less sure; late predictions are moved with their noise.
 6. The first direction starts the estimate on its ray, not at the observer, where no direction is predicted. Directions
    that cross are linearized anew where they come to; those of one ray are not, that would invent a range.
@@ -105,16 +106,16 @@ class _Covariance:
     def _seen(self, prior: TrackState, sights: Sights) -> TrackState:
         """A prior corrected by directions."""
         prior = self._begun(prior, sights)
-        S, y, most = _information(prior, prior.mean, sights, self)
+        S, y, most = _information(prior, prior, sights, self)
         again = crosses(sights, noises=CROSSING)
         lost = again & (most < DOUBTED) & (_position_variance(prior.matrix) < 3.0 * self.start_m**2)
         if lost.any():
             prior = TrackState(prior.mean, np.where(lost[..., None, None], LOOSENED * prior.matrix, prior.matrix))
-            S, y, _ = _information(prior, prior.mean, sights, self)
+            S, y, _ = _information(prior, prior, sights, self)
         known = np.asarray(np.linalg.inv(prior.matrix))
         state = _corrected(prior, known, S, y)
         for _ in range(ROUNDS - 1 if again.any() else 0):
-            S, y, _ = _information(prior, state.mean, sights, self)
+            S, y, _ = _information(prior, state, sights, self)
             new = _corrected(prior, known, S, y)
             mean = np.where(again[..., None], new.mean, state.mean)
             state = TrackState(mean, np.where(again[..., None, None], new.matrix, state.matrix))
@@ -143,12 +144,13 @@ def _corrected(prior: TrackState, known: Array, S: Array, y: Array) -> TrackStat
     return TrackState(prior.mean + (cov @ pull[..., None])[..., 0], cov)
 
 
-def _information(prior: TrackState, at: Array, sights: Sights, of: _Covariance) -> tuple[Array, Array, Array]:
-    """S (..., 6, 6) and S x (..., 6) of directions, linearized and weighed at `at` (..., 6); the largest robust weight.
+def _information(prior: TrackState, at: TrackState, sights: Sights, of: _Covariance) -> tuple[Array, Array, Array]:
+    """S (..., 6, 6) and S x (..., 6) of directions, linearized and weighed at `at`; the largest robust weight.
 
-    The spread is that of the prior, wherever it is linearized.
+    The noise is that at the prior's range, wherever it is linearized. What counts is what is near on the scale of the
+    spread of `at`: a vague prior lets anything pass, and where directions cross they tell which of them is false.
     """
-    there = moved(at[..., None, :], -sights.age)[..., :3] - sights.place
+    there = moved(at.mean[..., None, :], -sights.age)[..., :3] - sights.place
     away = np.linalg.norm(there, axis=-1)
     g = sights.direction / np.linalg.norm(sights.direction, axis=-1)[..., None]
     # An observer that takes the target to be where itself is predicts no direction.
@@ -158,7 +160,7 @@ def _information(prior: TrackState, at: Array, sights: Sights, of: _Covariance) 
     angle = np.arctan2(np.linalg.norm(np.cross(h, g), axis=-1), cosine)
     tangent = angle < TANGENT_RAD
     P = projection(np.where(tangent[..., None], h, g))
-    spread = np.trace(P @ prior.matrix[..., None, :3, :3], axis1=-2, axis2=-1) / 2.0
+    spread = np.trace(P @ at.matrix[..., None, :3, :3], axis1=-2, axis2=-1) / 2.0
     off = angle / (of.gate * np.sqrt(sights.sigma**2 + spread / r**2))
     counts = np.maximum((1.0 + off**2) ** -2, of.floor)
     across = (r * sights.sigma) ** 2 + of.q * sights.age**3 / 3.0

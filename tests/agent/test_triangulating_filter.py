@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,8 @@ from agent.effects import Broadcast
 from agent.estimation.motion import CONSTANT_VELOCITY_3D, SpatialMotion, TargetMotion
 from agent.events import LinkChange, Observation, Odometry, Received, Tick
 from agent.settings import NS, AgentSettings, LocalizationSettings, RoundSettings, TargetSettings, TrackingSettings
-from network.messages import Bearing, BearingReport, Header, Message, Prediction
+from network.messages import MAX_MESSAGE_BYTES, Bearing, BearingReport, Header, Message, Prediction
+from network.wire import size_bound
 
 PERIOD_NS, WAIT_NS = NS // 10, NS // 50
 TARGET = np.array([20.0, 0.0, 5.0])
@@ -18,7 +21,7 @@ PLACES = {"r1": np.array([0.0, -8.0, 0.0]), "r2": np.array([0.0, 8.0, 0.0])}
 SIGMA = 0.01
 
 
-def robot(kind: str = "icf_plus") -> Agent:
+def robot(kind: str = "icf_plus", names: tuple[str, ...] = ("t1",)) -> Agent:
     motion = TargetMotion(CONSTANT_VELOCITY_3D, noise_sigma=(2.0,) * 3, noise_step_s=0.1)
     return Agent(
         AgentSettings(
@@ -27,7 +30,9 @@ def robot(kind: str = "icf_plus") -> Agent:
             np.append(PLACES["r1"], 0.0),
             1e-6 * np.eye(4),
             motion=SpatialMotion(),
-            targets=(TargetSettings("t1", motion, None, np.diag([0.0, 0.0, 100.0, 4.0, 4.0, 4.0])),),
+            targets=tuple(
+                TargetSettings(name, motion, None, np.diag([0.0, 0.0, 100.0, 4.0, 4.0, 4.0])) for name in names
+            ),
             localization=LocalizationSettings(kind="fixed"),
             tracking=TrackingSettings(kind),  # type: ignore[arg-type]
             round=RoundSettings(PERIOD_NS, 0, WAIT_NS),
@@ -40,14 +45,17 @@ def towards(place: np.ndarray) -> np.ndarray:
     return np.asarray(away / np.linalg.norm(away))
 
 
-def play(agent: Agent, k: int, see: bool = True, ends: bool = True) -> list[BearingReport]:
+def play(
+    agent: Agent, k: int, see: bool = True, ends: bool = True, names: tuple[str, ...] = ("t1",)
+) -> list[BearingReport]:
     """Odometry and a sighting at the instant of round k, and then its end; what it tells."""
     t_ns, told = k * PERIOD_NS, []
     events = [Odometry(t_ns, t_ns - PERIOD_NS, t_ns, np.zeros(4), np.zeros((4, 4)))]
     x, y, z = towards(PLACES["r1"])
     if see:
         angles = np.array([np.arctan2(y, x), np.arcsin(z)])
-        events.append(Observation(t_ns, t_ns, "bearing3", "target:t1", angles, SIGMA**2 * np.eye(2), "camera"))
+        for name in names:
+            events.append(Observation(t_ns, t_ns, "bearing3", f"target:{name}", angles, SIGMA**2 * np.eye(2), "camera"))
     events.append(Tick(t_ns))
     if ends:
         events.append(Tick(t_ns + WAIT_NS))
@@ -86,6 +94,21 @@ def test_each_kind_tells_what_its_neighbours_need(kind: str, parts: tuple[int, i
     play(agent, 1)
     (found,) = play(agent, 2)
     assert (len(found.bearings), len(found.predictions)) == parts
+
+
+def test_more_targets_than_a_message_holds_are_told_in_turn() -> None:
+    names = tuple(f"target-number-{number}" for number in range(8))
+    agent, told_of = robot(names=names), Counter[str]()
+    for k in range(1, 17):
+        (found,) = play(agent, k, names=names)
+        assert size_bound(found) <= MAX_MESSAGE_BYTES
+        assert [item.target for item in found.bearings] == sorted(item.target for item in found.bearings)
+        assert {item.target for item in found.bearings} == {item.target for item in found.predictions}
+        told_of.update(item.target for item in found.bearings)
+    left_out = 16 * len(names) - sum(told_of.values())
+    assert agent.counters["round.left_out"] == left_out > 0
+    assert set(told_of) == set(names)
+    assert max(told_of.values()) - min(told_of.values()) <= 1
 
 
 def test_alone_it_tells_no_place_and_says_why() -> None:
