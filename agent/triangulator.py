@@ -57,7 +57,7 @@ class _Track:
     crossed_ns: int | None = None
 
 
-def _only(report: BearingReport, targets: set[str]) -> BearingReport:
+def _only(report: BearingReport, targets: list[str]) -> BearingReport:
     bearings = tuple(item for item in report.bearings if item.target in targets)
     return BearingReport(bearings, tuple(item for item in report.predictions if item.target in targets))
 
@@ -75,7 +75,7 @@ class Triangulator:
         self._tracks: dict[str, _Track] = {}
         self._seen: dict[str, tuple[int, Directed]] = {}
         self._used: dict[str, int] = {}
-        self._told_ns: dict[str, int] = {}
+        self._turns = sorted(self._targets)
 
     def _options(self, target: TargetSettings) -> dict[str, float]:
         """What the settings say to a filter of the kind."""
@@ -115,18 +115,18 @@ class Triangulator:
             if track is not None and kind.tells_mean:
                 told = kind.predicted(track.state, (t_ns - track.t_ns) * 1e-9, self._own(target, t_ns))
                 predictions.append(Prediction(target, told.mean, told.cov if kind.tells_cov else None))
-        return self._fitting(t_ns, BearingReport(tuple(bearings), tuple(predictions)))
+        return self._fitting(BearingReport(tuple(bearings), tuple(predictions)))
 
-    def _fitting(self, t_ns: int, report: BearingReport) -> BearingReport:
-        """What fits into one message; who was told of longest ago comes first, so that all are told in turn."""
+    def _fitting(self, report: BearingReport) -> BearingReport:
+        """What fits into one message. Targets that are told go to the end of the queue: all are told in turn."""
         known = {item.target for item in (*report.bearings, *report.predictions)}
-        chosen: set[str] = set()
-        for target in sorted(known, key=lambda name: (self._told_ns.get(name, -1), name)):
-            if size_bound(_only(report, chosen | {target})) <= MAX_MESSAGE_BYTES:
-                chosen.add(target)
-                self._told_ns[target] = t_ns
+        chosen: list[str] = []
+        for target in (name for name in self._turns if name in known):
+            if size_bound(_only(report, [*chosen, target])) <= MAX_MESSAGE_BYTES:
+                chosen.append(target)
             else:
                 self._counters["round.left_out"] += 1
+        self._turns = [*(name for name in self._turns if name not in chosen), *chosen]
         return _only(report, chosen)
 
     def _own(self, target: str, t_ns: int) -> list[Sight]:

@@ -3,7 +3,8 @@
 Plays `stt-circle` and `stt-square` with every kind of `tracking.kind`, with the published layout of cameras and with
 ones drawn anew for each trial, all kinds on the same data, and prints a table in Markdown, with the centralized filters
 on top: the published one, and ours. Published kinds tell their track from the first bearing on. Trials that are
-finished stay in the output directory, so that an interrupted run goes on where it was.
+finished stay in the output directory, so that an interrupted run goes on where it was. With `--noise 0.01 0.05 ...` it
+plays `stt-noise`, cameras drawn anew and the square, and prints errors by noise.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import json
 import math
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,29 +102,62 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--kinds", nargs="+", default=[*PUBLISHED, *IMPROVED], choices=[*PUBLISHED, *IMPROVED])
     found.add_argument("--layouts", nargs="+", default=["fixed", "random"], choices=["fixed", "random", "faults"])
     found.add_argument("--scenarios", nargs="+", default=list(SCENARIOS), choices=SCENARIOS)
+    found.add_argument("--noise", nargs="+", type=float, default=[], metavar="SIGMA", help="play stt-noise, [rad]")
     found.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     found.add_argument("--out", type=Path, default=Path("runs/bearings"), help="where finished trials are")
     return found
 
 
+def played(options: argparse.Namespace, scenario: str, kind: str, case: str, changes: Sequence[str]) -> dict[str, Any]:
+    """The summary of a kind's trials of a scenario; `case` names where they are kept."""
+    command = ["montecarlo", scenario, "--trials", str(options.trials), "--seed", str(options.seed)]
+    command += ["--jobs", str(options.jobs), "--no-report", "--bound"]
+    alone = [] if kind in IMPROVED else ["tracking.parallax_rad=0"]
+    for change in [f"tracking.kind={kind}", *alone, *changes, *options.overrides]:
+        command += ["--set", change]
+    out = options.out / f"{scenario}-{case}-{kind}-{options.seed}-{options.trials}"
+    run(command, out)
+    summary: dict[str, Any] = json.loads((out / "summary.json").read_text())
+    return summary
+
+
+def bound_name(kind: str) -> str:
+    """The centralized filter that a kind is compared with."""
+    return "central_plus" if kind in IMPROVED else "ckf"
+
+
+def sweep(options: argparse.Namespace) -> str:
+    """RMSE of place [m] and velocity [m/s] from 10 s on by filter and noise, in Markdown."""
+    cells: dict[str, list[str]] = {}
+    for sigma in options.noise:
+        found: dict[str, str] = {}
+        for kind in options.kinds:
+            change = f"robots.*.sensors.camera.sigma_rad={sigma:g}"
+            summary = played(options, "stt-noise", kind, f"{sigma:g}", [change])
+            for name, which in ((bound_name(kind), "bound"), (kind, "fleet")):
+                figures = summary[which]
+                found.setdefault(
+                    name, f"{figures['target_position_rmse_m']:.2f} / {figures['target_velocity_rmse_mps']:.2f}"
+                )
+        for name, cell in found.items():
+            cells.setdefault(name, []).append(cell)
+    heads = ["filter", *(f"{sigma:g} rad" for sigma in options.noise)]
+    lines = [f"**stt-noise, {options.trials} trials**", "", f"| {' | '.join(heads)} |", f"|{' --- |' * len(heads)}"]
+    return "\n".join([*lines, *(f"| `{name}` | {' | '.join(row)} |" for name, row in cells.items()), ""])
+
+
 def main(arguments: list[str] | None = None) -> int:
     options = parser().parse_args(arguments)
+    if options.noise:
+        print(sweep(options), flush=True)
+        return 0
     for scenario in options.scenarios:
         for layout in options.layouts:
             rows: dict[str, Row] = {}
+            changes = [*([] if layout == "fixed" else [RANDOM]), *(FAULTS if layout == "faults" else ())]
             for kind in options.kinds:
-                improved = kind in IMPROVED
-                changes = [f"tracking.kind={kind}", *([] if improved else ["tracking.parallax_rad=0"])]
-                changes += [] if layout == "fixed" else [RANDOM]
-                changes += FAULTS if layout == "faults" else ()
-                command = ["montecarlo", scenario, "--trials", str(options.trials), "--seed", str(options.seed)]
-                command += ["--jobs", str(options.jobs), "--no-report", "--bound"]
-                for change in [*changes, *options.overrides]:
-                    command += ["--set", change]
-                out = options.out / f"{scenario}-{layout}-{kind}-{options.seed}-{options.trials}"
-                run(command, out)
-                summary = json.loads((out / "summary.json").read_text())
-                rows.setdefault("central_plus" if improved else "ckf", row(summary, "bound"))
+                summary = played(options, scenario, kind, layout, changes)
+                rows.setdefault(bound_name(kind), row(summary, "bound"))
                 rows[kind] = row(summary)
             print(table(rows, f"{scenario}, {layout}, {options.trials} trials"), flush=True)
     return 0

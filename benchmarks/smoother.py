@@ -4,8 +4,9 @@ Bearings are those of `stt-circle` and `stt-square`. The smoother has them all i
 do: a state of place and velocity per step, a factor of white acceleration between two of them, and one of the
 directions of a step. The whole graph is optimized anew at every step, from where the last optimum was, as in the
 published comparison (STT 2023, Table 1). `newest` is what it says of a step at that step, `smoothed` what it says of it
-in the end. Filters of robots are played robot by robot, each hears its nearest; there are no messages here. Times are of
-whole trials on one core, as ratios to the first filter's.
+in the end. It is one of plain least squares, as `plain` is, which is `central_plus` without its weights against
+directions that are off. Filters of robots are played robot by robot, each hears its nearest; there are no messages
+here. Times are of whole trials on one core, as ratios to the first filter's.
 """
 
 from __future__ import annotations
@@ -37,6 +38,9 @@ SCENARIOS = ("stt-circle", "stt-square")
 CENTRALIZED: tuple[Kind, ...] = ("ckf", "central_plus")
 DISTRIBUTED: tuple[Kind, ...] = ("stt", "icf_plus")
 TAIL_S = 10.0
+PLAIN = 1e6
+"""A gate that lets anything pass."""
+
 START_M, START_MPS = 30.0, 5.0
 MISSING = "benchmarks.smoother: gtsam is not installed; python -m pip install --editable '.[smoother]'"
 
@@ -83,7 +87,7 @@ def bearings(scenario: Scenario, seed: int) -> Bearings:
                 row = k, robots.index(item.robot)
                 directions[row], sigma[row] = found.direction, found.sigma_rad
     if np.isnan(sigma).any():
-        raise ValueError(f"{scenario.name}: cameras must all see the target at each step; leave their rates as they are")
+        raise ValueError(f"{scenario.name}: all cameras must see the target at each step; leave their rates")
     places = np.array([world.place(robot, 0) for robot in robots])
     gaps = np.linalg.norm(places[:, None] - places, axis=-1)
     near = np.argsort(gaps, axis=-1)[:, 1 : 1 + (scenario.links.nearest or len(robots))]
@@ -97,10 +101,10 @@ def _options(kind: Kind, made: Bearings) -> dict[str, float]:
     return {"q": made.q} if kind.endswith("_plus") else {}
 
 
-def centralized(kind: Kind, made: Bearings) -> Played:
-    """A filter that has all bearings."""
+def centralized(kind: Kind, made: Bearings, **options: float) -> Played:
+    """A filter that has all bearings; `options` of it."""
     began = time.perf_counter()
-    chosen, errors = build(kind, _options(kind, made)), []
+    chosen, errors = build(kind, _options(kind, made) | options), []
     state = chosen.start(made.places.mean(axis=0))
     for truth, directions, sigma in zip(made.truth, made.directions, made.sigma):
         sights = [Sight(*seen) for seen in zip(made.places, directions, sigma)]
@@ -142,15 +146,15 @@ class Smoother:
         gtsam, made, k = self._gtsam, self._made, self._count
         noise = gtsam.noiseModel
         if k == 0:
-            first = np.append(_nearest(made.places, made.directions[0]), np.zeros(3))
+            first = np.append(nearest(made.places, made.directions[0]), np.zeros(3))
             middle = np.append(made.places.mean(axis=0), np.zeros(3))
             start = noise.Diagonal.Sigmas(np.array([START_M] * 3 + [START_MPS] * 3))
             self._graph.add(gtsam.PriorFactorVector(0, middle, start))
         else:
             first = transition(made.dt) @ self._values.atVector(k - 1)
-            self._graph.add(gtsam.CustomFactor(self._motion, [k - 1, k], _motion_error(transition(made.dt))))
+            self._graph.add(gtsam.CustomFactor(self._motion, [k - 1, k], motion_error(transition(made.dt))))
         across = noise.Diagonal.Sigmas(np.repeat(made.sigma[k], 2))
-        self._graph.add(gtsam.CustomFactor(across, [k], _bearing_error(made.places, made.directions[k])))
+        self._graph.add(gtsam.CustomFactor(across, [k], bearing_error(made.places, made.directions[k])))
         self._values.insert(k, first)
         self._count += 1
         self._values = gtsam.LevenbergMarquardtOptimizer(self._graph, self._values, self._options).optimize()
@@ -161,7 +165,7 @@ class Smoother:
         return np.array([self._values.atVector(k) for k in range(self._count)])
 
 
-def _nearest(places: Array, directions: Array) -> Array:
+def nearest(places: Array, directions: Array) -> Array:
     """The place (3,) nearest to all rays."""
     P = projection(directions / np.linalg.norm(directions, axis=-1)[:, None])
     return np.asarray(np.linalg.solve(P.sum(axis=0), (P @ places[..., None])[..., 0].sum(axis=0)))
@@ -170,9 +174,10 @@ def _nearest(places: Array, directions: Array) -> Array:
 Error = Callable[[Any, Any, Any], Array]
 
 
-def _motion_error(A: Array) -> Error:
+def motion_error(A: Array) -> Error:
     def error(factor: Any, values: Any, jacobians: Any) -> Array:
-        before, after = (values.atVector(key) for key in factor.keys())
+        first, second = factor.keys()
+        before, after = values.atVector(first), values.atVector(second)
         if jacobians is not None:
             jacobians[0], jacobians[1] = -A, np.eye(6)
         return np.asarray(after - A @ before)
@@ -180,7 +185,7 @@ def _motion_error(A: Array) -> Error:
     return error
 
 
-def _bearing_error(places: Array, directions: Array) -> Error:
+def bearing_error(places: Array, directions: Array) -> Error:
     """Of the predicted directions in the planes (2 axes each) across those measured, (2 n,)."""
     axes = np.linalg.svd((directions / np.linalg.norm(directions, axis=-1)[:, None])[:, None, :])[2][:, 1:]
 
@@ -247,6 +252,7 @@ def main(arguments: list[str] | None = None) -> int:
             made = bearings(scenario, seed)
             for kind in CENTRALIZED:
                 played.setdefault(kind, []).append(centralized(kind, made))
+            played.setdefault("plain", []).append(centralized("central_plus", made, gate=PLAIN))
             for kind in DISTRIBUTED:
                 played.setdefault(kind, []).append(distributed(kind, made))
             for which, found in zip(("newest", "smoothed"), smoothed(made, gtsam)):

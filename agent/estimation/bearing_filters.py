@@ -10,7 +10,8 @@ Against the published ones (`agent.estimation.triangulation`):
 3. The covariance is that of a target with white acceleration of density q, which forgetting only imitates.
 4. Directions far off the prediction, on the scale of its own spread, count less, but never nothing: a robot that has
    lost the target can find it again. Where directions cross and all are far off, the prediction is what is doubted,
-   and they are weighed again by how near they pass to where they come to.
+   and they are weighed again by how near they pass to where they come to. If a share q of them is off even then, that
+   place is taken to be wrong with probability q^2, and the covariance is that of a mixture with the prior.
 5. Late directions are used at their own instant, q tau^3 / 3 less sure; late predictions are moved with their noise.
 6. The first direction starts the estimate on its ray, not at the observer, where no direction is predicted. Directions
    that cross are linearized anew where they come to; those of one ray are not, that would invent a range.
@@ -59,6 +60,9 @@ CROSSING = 4.0
 DOUBTED, LOOSENED = 0.1, 4.0
 """The covariance of a prediction grows LOOSENED times where no direction counts more than DOUBTED."""
 
+OFF = 0.25
+"""What a direction counts that is off: `gate` deviations."""
+
 LATENESS_S = 0.2
 """Age of a prediction told at which it counts exp(-1)."""
 
@@ -106,20 +110,23 @@ class _Covariance:
     def _seen(self, prior: TrackState, sights: Sights) -> TrackState:
         """A prior corrected by directions."""
         prior = self._begun(prior, sights)
-        S, y, most = _information(prior, prior, sights, self)
+        S, y, counts = _information(prior, prior, sights, self)
         again = crosses(sights, noises=CROSSING)
-        lost = again & (most < DOUBTED) & (_position_variance(prior.matrix) < 3.0 * self.start_m**2)
+        doubted = counts.max(axis=-1, initial=0.0) < DOUBTED
+        lost = again & doubted & (_position_variance(prior.matrix) < 3.0 * self.start_m**2)
         if lost.any():
             prior = TrackState(prior.mean, np.where(lost[..., None, None], LOOSENED * prior.matrix, prior.matrix))
             S, y, _ = _information(prior, prior, sights, self)
         known = np.asarray(np.linalg.inv(prior.matrix))
         state = _corrected(prior, known, S, y)
         for _ in range(ROUNDS - 1 if again.any() else 0):
-            S, y, _ = _information(prior, state, sights, self)
+            S, y, counts = _information(prior, state, sights, self)
             new = _corrected(prior, known, S, y)
             mean = np.where(again[..., None], new.mean, state.mean)
             state = TrackState(mean, np.where(again[..., None, None], new.matrix, state.matrix))
-        return state
+        # Those that are off may be the true ones, and where the others come to be wrong: a mixture with the prior then.
+        wrong = np.where(again, (sights.used & (counts < OFF)).sum(axis=-1) / np.maximum(sights.count(), 1.0), 0.0)
+        return TrackState(state.mean, state.matrix + (wrong**2)[..., None, None] * prior.matrix)
 
     def _begun(self, prior: TrackState, sights: Sights) -> TrackState:
         """The prior; where nothing at all is known of the place, moved onto the first ray."""
@@ -145,7 +152,7 @@ def _corrected(prior: TrackState, known: Array, S: Array, y: Array) -> TrackStat
 
 
 def _information(prior: TrackState, at: TrackState, sights: Sights, of: _Covariance) -> tuple[Array, Array, Array]:
-    """S (..., 6, 6) and S x (..., 6) of directions, linearized and weighed at `at`; the largest robust weight.
+    """S (..., 6, 6) and S x (..., 6) of directions, linearized and weighed at `at`; what each counts (..., m).
 
     The noise is that at the prior's range, wherever it is linearized. What counts is what is near on the scale of the
     spread of `at`: a vague prior lets anything pass, and where directions cross they tell which of them is false.
@@ -170,7 +177,7 @@ def _information(prior: TrackState, at: TrackState, sights: Sights, of: _Covaria
     meets = away / np.where(tangent, cosine, 1.0)
     towards = np.where(tangent[..., None], sights.place + meets[..., None] * g, sights.place)
     S, y = normal_equations(sights, W, towards)
-    return S, y, np.max(np.where(sights.used, counts, 0.0), axis=-1, initial=0.0)
+    return S, y, np.where(sights.used, counts, 0.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from agent.estimation.bearing_filters import FILTERS, Kind, acceleration_noise, build
 from agent.estimation.sights import Sight, Told
 from agent.estimation.triangulation import TrackState, transition
-from tests.agent.estimation.triangulation_world import DT, MODERATE, Faults, Run, play, world
+from tests.agent.estimation.triangulation_world import DT, MODERATE, Faults, Run, course, play, world
 from tests.sizes import sized
 
 Array = NDArray[np.float64]
@@ -153,6 +153,17 @@ def test_faults_do_not_make_it_overconfident(kind: Kind, faults: Faults) -> None
         assert run.anees(run.tail) < 1.15, f"seed {seed}"
         if faults == MODERATE:
             assert run.position(run.tail) < 1.1 * 1.7, f"seed {seed}"
+
+
+@pytest.mark.parametrize("kind", ["kcf_plus", "icf_plus"])
+def test_false_directions_do_not_make_a_beginning_overconfident(kind: Kind) -> None:
+    """One in five is false, and a prior of 30 m lets all of them pass; 2 and more if what crosses is believed."""
+    for target in ("circle", "square"):
+        for seed in (45, 46):
+            made = world(seed, 12, course(target, 40), fixed=False, faults=Faults(false=0.2))
+            run = play(made, kind)
+            assert run.anees(slice(0, 30)) < 1.15, f"seed {seed}"
+            assert run.position(slice(30, 40)) < 4.0, f"seed {seed}"
 
 
 def test_a_robot_that_hears_nobody_stays_unsure_of_the_range() -> None:
