@@ -4,7 +4,8 @@ Plays `stt-circle` and `stt-square` with every kind of `tracking.kind`, with the
 ones drawn anew for each trial, all kinds on the same data, and prints a table in Markdown, with the centralized filters
 on top: the published one, and ours. Published kinds tell their track from the first bearing on. Trials that are
 finished stay in the output directory, so that an interrupted run goes on where it was. With `--noise 0.01 0.05 ...` it
-plays `stt-noise`, cameras drawn anew and the square, and prints errors by noise.
+plays `stt-noise`, cameras drawn anew and the square, and prints errors by noise; with `--breaks`, errors and ANEES of
+`stt-circle` with each of what a fleet must bear.
 """
 
 from __future__ import annotations
@@ -37,6 +38,20 @@ FAULTS = (
     "robots.*.sensors.camera.false_share=0.05",
 )
 TAIL_S = 10.0
+
+BREAKS: dict[str, list[str]] = {
+    "nominal": [],
+    "70 % loss": ["links.loss=0.7"],
+    "0.3 s late": ["links.delay_s=0.3"],
+    "5 % false": ["robots.*.sensors.camera.false_share=0.05"],
+    "isolated": ["links.loss=1.0"],
+    "parallel": [
+        "robots.*.start={pose = [-40.0, 0.0, 0.0, 0.0], spread = [1.0, 1.0, 1.0, 3.1415926], "
+        "error = [0.0, 0.0, 0.0, 0.0]}"
+    ],
+}
+"""Isolated: nobody hears anybody. Parallel: all within 2 m, the target 24 to 56 m away."""
+
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +117,8 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--kinds", nargs="+", default=[*PUBLISHED, *IMPROVED], choices=[*PUBLISHED, *IMPROVED])
     found.add_argument("--layouts", nargs="+", default=["fixed", "random"], choices=["fixed", "random", "faults"])
     found.add_argument("--scenarios", nargs="+", default=list(SCENARIOS), choices=SCENARIOS)
-    found.add_argument("--noise", nargs="+", type=float, default=[], metavar="SIGMA", help="play stt-noise, [rad]")
+    found.add_argument("--noise", nargs="+", type=float, default=[], metavar="SIGMA", help="play stt-noise [rad]")
+    found.add_argument("--breaks", action="store_true", help="play stt-circle with what may break a kind instead")
     found.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     found.add_argument("--out", type=Path, default=Path("runs/bearings"), help="where finished trials are")
     return found
@@ -115,7 +131,7 @@ def played(options: argparse.Namespace, scenario: str, kind: str, case: str, cha
     alone = [] if kind in IMPROVED else ["tracking.parallax_rad=0"]
     for change in [f"tracking.kind={kind}", *alone, *changes, *options.overrides]:
         command += ["--set", change]
-    out = options.out / f"{scenario}-{case}-{kind}-{options.seed}-{options.trials}"
+    out = options.out / f"{scenario}-{case.replace(' ', '-')}-{kind}-{options.seed}-{options.trials}"
     run(command, out)
     summary: dict[str, Any] = json.loads((out / "summary.json").read_text())
     return summary
@@ -126,30 +142,49 @@ def bound_name(kind: str) -> str:
     return "central_plus" if kind in IMPROVED else "ckf"
 
 
-def sweep(options: argparse.Namespace) -> str:
-    """RMSE of place [m] and velocity [m/s] from 10 s on by filter and noise, in Markdown."""
+Columns = dict[str, tuple[str, str, list[str]]]
+"""By heading: scenario, name of the case, what is set."""
+
+
+def noises(sigmas: Sequence[float]) -> Columns:
+    """Of the scenario that noise is swept in."""
+    return {
+        f"{sigma:g} rad": ("stt-noise", f"{sigma:g}", [f"robots.*.sensors.camera.sigma_rad={sigma:g}"])
+        for sigma in sigmas
+    }
+
+
+def breaks() -> Columns:
+    """Of what each kind must bear."""
+    window = f"window_s=[{TAIL_S}, 20.0]"
+    return {name: ("stt-circle", name, [window, *changes]) for name, changes in BREAKS.items()}
+
+
+def sweep(options: argparse.Namespace, columns: Columns, second: str) -> str:
+    """RMSE of place [m] and a `second` figure by filter and column, from 10 s on, in Markdown; - where none is told."""
     cells: dict[str, list[str]] = {}
-    for sigma in options.noise:
+    for scenario, case, changes in columns.values():
         found: dict[str, str] = {}
         for kind in options.kinds:
-            change = f"robots.*.sensors.camera.sigma_rad={sigma:g}"
-            summary = played(options, "stt-noise", kind, f"{sigma:g}", [change])
+            summary = played(options, scenario, kind, case, changes)
             for name, which in ((bound_name(kind), "bound"), (kind, "fleet")):
-                figures = summary[which]
-                found.setdefault(
-                    name, f"{figures['target_position_rmse_m']:.2f} / {figures['target_velocity_rmse_mps']:.2f}"
-                )
+                figures = summary[which]["target_position_rmse_m"], summary[which][second]
+                told = None not in figures
+                found.setdefault(name, f"{figures[0]:.2f} / {figures[1]:.2f}" if told else "-")
         for name, cell in found.items():
             cells.setdefault(name, []).append(cell)
-    heads = ["filter", *(f"{sigma:g} rad" for sigma in options.noise)]
-    lines = [f"**stt-noise, {options.trials} trials**", "", f"| {' | '.join(heads)} |", f"|{' --- |' * len(heads)}"]
+    heads = ["filter", *columns]
+    lines = [f"**{options.trials} trials**", "", f"| {' | '.join(heads)} |", f"|{' --- |' * len(heads)}"]
     return "\n".join([*lines, *(f"| `{name}` | {' | '.join(row)} |" for name, row in cells.items()), ""])
 
 
 def main(arguments: list[str] | None = None) -> int:
     options = parser().parse_args(arguments)
-    if options.noise:
-        print(sweep(options), flush=True)
+    if options.noise or options.breaks:
+        if options.noise:
+            print(sweep(options, noises(options.noise), "target_velocity_rmse_mps"), flush=True)
+        if options.breaks:
+            print(sweep(options, breaks(), "target_anees"), flush=True)
         return 0
     for scenario in options.scenarios:
         for layout in options.layouts:

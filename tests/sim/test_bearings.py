@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from benchmarks.bearings import main, row
+from benchmarks.bearings import breaks, main, noises, row
+from sim.scenario_file import load
 
 SHORT = ("--set", "duration_s=1.5", "--set", "window_s=[1.0, 1.5]")
 
@@ -33,6 +34,15 @@ def test_a_sweep_has_a_row_for_each_filter_and_a_column_for_each_noise(
             assert line[column] == told
     fine, coarse = (float(cell.partition(" / ")[0]) for cell in ours[1:])
     assert fine < 0.5 * coarse
+
+
+def test_columns_are_scenarios_of_their_own() -> None:
+    columns = breaks() | noises([0.05])
+    made = {name: load(scenario, changes) for name, (scenario, _, changes) in columns.items()}
+    assert len({scenario.model_dump_json() for scenario in made.values()}) == len(columns) == 7
+    assert made["isolated"].links.loss == 1.0 and made["0.3 s late"].links.delay_s == 0.3
+    assert made["0.05 rad"].robots[3].sensors["camera"].sigma_rad == 0.05
+    assert all(scenario.window_s == [10.0, 20.0] for scenario in made.values())
 
 
 def test_what_is_told_from_ten_seconds_on_is_the_tail() -> None:

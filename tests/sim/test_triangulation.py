@@ -71,6 +71,21 @@ def test_claims_are_honest_with_all_faults_at_once(kind: str) -> None:
     assert np.isfinite(found).mean() > 0.8
 
 
+@pytest.mark.parametrize("kind", IMPROVED)
+def test_claims_are_honest_of_what_cameras_tell_their_robots_late(kind: str) -> None:
+    """Half of the frames are lost, the others come 0.7 s late on the mean, so that a newer one may come before."""
+    faults = []
+    for number in range(1, 11):
+        of = f'robot = "c{number}", sensor = "camera"'
+        faults.append(f'{{kind = "sensor_dropout", share = 0.5, {of}}}, {{kind = "sensor_delay", tail_s = 0.7, {of}}}')
+    scenario = cameras(kind, f"faults=[{', '.join(faults)}]")
+    results = [run_trial(scenario, seed, checker=InvariantChecker(seed)) for seed in SEEDS]
+    assert_no_overconfidence(results)
+    found = np.concatenate([errors(result) for result in results])
+    assert float(np.sqrt(np.nanmean(found**2))) < 4.0
+    assert np.isfinite(found).mean() > 0.8
+
+
 def assert_no_overconfidence(results: list[TrialResult]) -> None:
     values = []
     for result in results:
