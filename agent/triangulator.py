@@ -119,7 +119,7 @@ class Triangulator:
 
     def _fitting(self, report: BearingReport) -> BearingReport:
         """What fits into one message. Targets that are told go to the end of the queue: all are told in turn."""
-        known = {item.target for item in (*report.bearings, *report.predictions)}
+        known = {item.target for item in report.bearings} | {item.target for item in report.predictions}
         chosen: list[str] = []
         for target in (name for name in self._turns if name in known):
             if size_bound(_only(report, [*chosen, target])) <= MAX_MESSAGE_BYTES:
