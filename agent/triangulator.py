@@ -1,8 +1,9 @@
 """Tracks of targets by bearings that robots tell each other once per round (`agent.estimation.bearing_filters`).
 
 At each round a robot tells where it has seen each target from, and in which direction, and where it expects the target
-to be; when its neighbours have told the same, it makes one step of its filter. What comes late is used in the next
-round, at its own age, and once. A track is made known only once bearings of several robots have crossed.
+to be; when its neighbours have told the same, it makes one step of its filter. What comes late is used once: with
+filters of true covariance in the round it is of, from which on the steps are made again; with published ones in the
+next round, at its own age. A track is made known only once bearings of several robots have crossed.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,10 @@ PRECISE = ("kcf_plus", "icf_plus")
 RECENT_S = 0.5
 """A target hardly moves meanwhile, so that bearings of a moment ago cross those of now where it is."""
 
+REPEATED = 20
+"""Rounds that can be made again; what is older is used in the oldest of them, at its age. Bearings used at their ages
+err together, in one round and the next, by what the target has accelerated since: noise of each cannot say that."""
+
 UNCROSSED_NS = 5_000_000_000
 """A track is no longer made known when bearings have not crossed for so long: along the ray nothing is known then."""
 
@@ -48,13 +53,43 @@ def density(motion: TargetMotion) -> float:
 
 
 @dataclass(slots=True, eq=False)
+class _Round:
+    """A step to `t_ns` from the state `before`, of `before_ns`, with sights by their instants and what was told."""
+
+    t_ns: int
+    before_ns: int
+    before: TrackState
+    told: list[Told]
+    sights: list[tuple[int, Sight]] = field(default_factory=list)
+
+    def seen(self) -> list[Sight]:
+        return [replace(sight, age_s=max(self.t_ns - at_ns, 0) * 1e-9) for at_ns, sight in self.sights]
+
+
+@dataclass(slots=True, eq=False)
 class _Track:
-    """State at `t_ns`; when something was last learnt, and when bearings last crossed."""
+    """State at `t_ns`; when something was last learnt, and when bearings last crossed; the last rounds."""
 
     t_ns: int
     state: TrackState
     learnt_ns: int
     crossed_ns: int | None = None
+    rounds: list[_Round] = field(default_factory=list)
+
+    def step(self, t_ns: int, kind: BearingFilter, sights: list[Sight], told: list[Told], kept: int) -> TrackState:
+        """State at `t_ns`, with sights of ages then: of the last `kept` rounds, those since the oldest sight anew."""
+        self.rounds = [*self.rounds[len(self.rounds) - kept + 1 :], _Round(t_ns, self.t_ns, self.state, told)]
+        first = len(self.rounds) - 1
+        for sight in sights:
+            at_ns = t_ns - round(float(sight.age_s) * 1e9)
+            of = next(index for index, item in enumerate(self.rounds) if item.t_ns >= at_ns)
+            self.rounds[of].sights.append((at_ns, sight))
+            first = min(first, of)
+        state = self.rounds[first].before
+        for item in self.rounds[first:]:
+            item.before = state
+            state = kind.step(state, (item.t_ns - item.before_ns) * 1e-9, item.seen(), item.told)
+        return state
 
 
 def _only(report: BearingReport, targets: list[str]) -> BearingReport:
@@ -145,6 +180,8 @@ class Triangulator:
             except (np.linalg.LinAlgError, ValueError):
                 # Of numbers that are too far apart for arithmetic, or neighbours with filters of another kind.
                 self._counters["update.failed"] += 1
+                if target in self._tracks:
+                    self._tracks[target].rounds = []
         for item in new:
             remember(self._used, item.peer, item.t_ns)
         self._seen = {target: seen for target, seen in self._seen.items() if seen[0] > t_ns}
@@ -159,16 +196,22 @@ class Triangulator:
                 return
             track = self._begin(target, t_ns, place)
         if sights:
-            track.learnt_ns = t_ns - round(min(float(item.age_s) for item in sights) * 1e9)
-        state = self._filters[target].step(track.state, (t_ns - track.t_ns) * 1e-9, sights, told)
+            learnt_ns = t_ns - round(min(float(item.age_s) for item in sights) * 1e9)
+            track.learnt_ns = max(track.learnt_ns, learnt_ns)
+        kept = REPEATED if self._settings.tracking.kind in PRECISE else 1
+        state = track.step(t_ns, self._filters[target], sights, told, kept)
         if not self._sane(state):
             del self._tracks[target]
             self._counters["track.diverged"] += 1
             return
         track.state, track.t_ns = state, t_ns
         self._counters["round.used_bearings"] += len(sights)
-        if self._crossing(sights):
-            track.crossed_ns = t_ns
+        for item in reversed(track.rounds):
+            if track.crossed_ns is not None and item.t_ns <= track.crossed_ns:
+                break
+            if self._crossing(item.seen()):
+                track.crossed_ns = item.t_ns
+                break
 
     def _begin(self, target: str, t_ns: int, place: Array) -> _Track:
         track = self._tracks[target] = self._begun(target, t_ns, place)
@@ -184,7 +227,7 @@ class Triangulator:
         return _Track(before_ns, self._filters[target].start(place), before_ns)
 
     def _crossing(self, sights: list[Sight]) -> bool:
-        """Whether bearings of about now tell a place."""
+        """Whether bearings of about a round's instant tell a place."""
         parallax = self._settings.tracking.parallax_rad
         if parallax == 0.0:
             return True
