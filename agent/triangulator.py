@@ -88,8 +88,8 @@ class _Track:
         state = self.rounds[first].before
         for item in self.rounds[first:]:
             item.before = state
-            # A mean without covariance says nothing of how little its robot knew then, without what has come since.
-            told = item.told if kind.tells_cov or item is self.rounds[-1] else []
+            # Neighbours knew less then: their means would mislead, their covariances weaken what is known of it now.
+            told = item.told if item is self.rounds[-1] else []
             state = kind.step(state, (item.t_ns - item.before_ns) * 1e-9, item.seen(), told)
         return state
 
