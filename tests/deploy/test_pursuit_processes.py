@@ -20,9 +20,10 @@ COMMAND = (sys.executable, "-P", "-m", "deploy.cli", "run", "stt-pursuit", "--ru
 
 def test_pursuers_form_and_keep_their_formation(tmp_path: Path) -> None:
     """They begin 9 to 14 m apart, 15 m from the target, and have formed after 10 s."""
+    window = f"window_s=[10.0, {SECONDS}]"
+    times = ["--duration", f"{SECONDS:g}", "--speed", f"{SPEED:g}", "--set", window]
     run = subprocess.run(
-        [*COMMAND, "--duration", f"{SECONDS:g}", "--speed", f"{SPEED:g}", "--seed", "3", "--json", "--no-report"]
-        + ["--set", f"window_s=[10.0, {SECONDS}]", "--out", "run"],
+        [*COMMAND, *times, "--seed", "3", "--json", "--no-report", "--out", "run"],
         capture_output=True,
         text=True,
         timeout=180,
