@@ -24,7 +24,7 @@ NEAREST_M = 1e-3
 """Robots are taken to be at least so far apart: at none a range has no direction."""
 
 OVERHEAD = 3.0
-"""A robot less than so many deviations off the vertical axis has no azimuth that could be linearized."""
+"""A robot whose horizontal distance is less than so many of its deviations has no azimuth that can be linearized."""
 
 WIDE_RAD2 = 1.0
 """Variance of a heading from which on the published gate is a circle."""
@@ -96,7 +96,8 @@ def direction(mean: Array, cov: Array, noise: Array, modified: bool) -> Directio
     H[..., 1, 0], H[..., 1, 1], H[..., 1, 2] = x * slope, y * slope, flat / far2
     expected = np.stack([np.arctan2(y, x), np.arctan2(z, flat)], axis=-1)
     R = np.broadcast_to(noise, (*mean.shape[:-1], 2, 2)).copy()
-    R[..., 0, 0] += np.where(flat2 < OVERHEAD**2 * (cov[..., 0, 0] + cov[..., 1, 1]) * 0.5, math.pi**2, 0.0)
+    radial = (x * x * cov[..., 0, 0] + 2.0 * x * y * cov[..., 0, 1] + y * y * cov[..., 1, 1]) / flat2
+    R[..., 0, 0] += np.where(flat2 < OVERHEAD**2 * radial, math.pi**2, 0.0)
     turned = H.swapaxes(-1, -2)
     S = H @ cov @ turned + R
     return Direction(expected, H, S, H @ widened(cov) @ turned + R if modified else S)
