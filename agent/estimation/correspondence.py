@@ -70,8 +70,9 @@ class Scan:
 class Hypotheses:
     """What is told of one target: best first, at most five.
 
-    weights (k,), means (k, 4), covs (k, 4, 4); where fusion subtracts what was told before also priors (k, 4), prior_covs
-    (k, 4, 4), which are those of the last fusion moved to the present, and prior_known (k,), False of younger tracks.
+    weights (k,), means (k, 4), covs (k, 4, 4). Where fusion subtracts what was known before, also priors (k, 4) and
+    prior_covs (k, 4, 4), the beliefs of the last fusion moved to the present, and prior_known (k,), False of younger
+    tracks.
     """
 
     weights: Array
@@ -84,8 +85,8 @@ class Hypotheses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dominant:
-    """The hypothesis that is believed: mean (4,), cov (4, 4), its weight, `ambiguity`, the weight of the second distinct
-    mode, the number of tracks, and whether it has been as good as certain for a while."""
+    """The hypothesis that is believed: mean (4,), cov (4, 4) and its weight; `ambiguity`, the weight of the second
+    distinct mode; the number of tracks; whether it has been as good as certain for a while."""
 
     mean: Array
     cov: Array
@@ -114,7 +115,18 @@ class CorrespondenceSettings:
     birth: float | None = None
     gate: float | None = None
     view_rad2: float = 2.0 * math.pi * 0.5 * math.pi
-    fusion: Literal["intersection", "subtraction"] | None = None
+    fusion: Fusion | None = None
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a number that is none of its kind."""
+        for key in ("detection", "birth", "gate"):
+            value = getattr(self, key)
+            if value is not None and not 0.0 < value <= 1.0 - (key == "gate") * np.finfo(float).eps:
+                raise ValueError(f"{key}: {value} is no probability: give more than 0, at most 1 (a gate less than 1)")
+        if not (math.isfinite(self.clutter) and self.clutter >= 0.0):
+            raise ValueError(f"clutter: {self.clutter} is no number of bearings: give 0 or more")
+        if not (math.isfinite(self.view_rad2) and self.view_rad2 > 0.0):
+            raise ValueError(f"view_rad2: {self.view_rad2} is no solid angle: give azimuth times elevation [rad^2]")
 
 
 class Correspondence:
@@ -153,7 +165,7 @@ class Correspondence:
         covs = np.array([peers[peer].cov for peer in self.peers]).reshape(-1, 4, 4)
         self._tracks = moved(self._tracks, own.velocity, own.cov, velocities, covs, dt_s, self._rules)
         self._snapshot = None
-        self._sure_s += dt_s
+        self._sure_s = np.where(np.bincount(self._tracks.of, minlength=len(self.peers)) > 0, self._sure_s + dt_s, 0.0)
 
     def scan(self, scan: Scan, labels: Mapping[str, int] | None = None) -> None:
         """Direct fusion of one scan; peers that have neither a range nor a height in it are untouched.

@@ -11,8 +11,8 @@ new tracks, for a robot may have been anywhere. Of heights and ranges it is know
 lambda is the density of bearings that are not the robot's [1/rad^2]: false ones and those of all the others. nu_r is
 what robots of whom there is no doubt leave of a bearing. Each sensor's stage is normalized by itself.
 
-Published: lambda is 1, and a heading that nothing is known of is one Gaussian of variance 4 pi. Improved: the density is
-that of the scan, and a fan of eight headings is begun, each of which can be linearized.
+Published: lambda is 1, and a heading that nothing is known of is one Gaussian of variance 4 pi. Improved: the density
+is that of the scan, and a fan of eight headings is begun, each of which can be linearized.
 
 The tracks of all robots are rows of the same arrays, so that a scan costs the same few calls whatever their number.
 """
@@ -46,6 +46,8 @@ Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
 FAN = 8
+FAN_RAD = wrap(2.0 * math.pi / FAN * np.arange(FAN, dtype=np.float64))
+FAN_RAD.flags.writeable = False
 FAN_SIGMA_RAD = 0.47
 PUBLISHED_BIRTH = np.array([0.1, 0.1, 0.05, 4.0 * math.pi])
 """Variances of a new track (eq. 13)."""
@@ -59,7 +61,7 @@ class Rules:
 
     detection, gate, birth   P_D, P_G, and the weight of a new track beside a sum of 1
     clutter                  lambda [1/rad^2]
-    strangeness, adoption    the same of told hypotheses: density of what is no track's [1/(m^3 rad)], weight of a new one
+    strangeness, adoption    of told hypotheses: density of those of no track [1/(m^3 rad)], weight of a new track
     improved                 exact moments, second order and fans; else linearized, with the modified gate
     floor, depth, family     least weight of a track; scans after which families are judged; their least weight
     most                     tracks of one robot
@@ -271,7 +273,7 @@ def _left_over(of: Rows, found: Array, unseen: Array, certain: Mask) -> Array:
 
 
 def _begun(tracks: Tracks, seen: Seen, inside: Mask, left: Array, rules: Rules) -> tuple[Array, Rows, Rows]:
-    """Weights, robots and bearings of new tracks (eq. 13): whose bearing is outside the gates of all tracks of weight."""
+    """Weights, robots and bearings of new tracks (eq. 13): of bearings outside the gates of all tracks of weight."""
     claimed = np.zeros(seen.possible.shape, dtype=np.bool_)
     heavy = tracks.weight > HEAVY
     np.logical_or.at(claimed, tracks.of[heavy], inside[heavy])
@@ -287,7 +289,7 @@ def _begun(tracks: Tracks, seen: Seen, inside: Mask, left: Array, rules: Rules) 
 
 
 def begun_tracks(of: Rows, weight: Array, bearing: Rows, seen: Seen, rules: Rules) -> Tracks:
-    """Tracks begun from ranges and bearings (eq. 13). Improved: a fan of each, whose place is as well known as it is."""
+    """Tracks begun from ranges and bearings (eq. 13). Improved: a fan of each, with the doubt that its place has."""
     r, (az, el) = seen.ranges[of], seen.bearings[bearing].T
     sa, ca, se, ce = np.sin(az), np.cos(az), np.sin(el), np.cos(el)
     mean, cov = np.zeros((len(of), 4)), np.zeros((len(of), 4, 4))
@@ -305,7 +307,7 @@ def begun_tracks(of: Rows, weight: Array, bearing: Rows, seen: Seen, rules: Rule
         known = seen.with_height[of]
         fitted = corrected(mean, cov, height(mean, cov, seen.heights[of], seen.height_vars[of]))
         mean, cov = np.where(known[:, None], fitted[0], mean), np.where(known[:, None, None], fitted[1], cov)
-        headings = np.tile(wrap(np.arange(FAN) * (2.0 * math.pi / FAN)), len(of))
+        headings = np.tile(FAN_RAD, len(of))
         of, weight = np.repeat(of, FAN), np.repeat(weight / FAN, FAN)
         mean, cov = np.repeat(mean, FAN, axis=0), np.repeat(cov, FAN, axis=0)
         mean[:, 3] = headings

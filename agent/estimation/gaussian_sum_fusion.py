@@ -3,9 +3,9 @@
 Each told hypothesis is matched with each own track as a bearing would be: with weight w_i w_e N(m_e - m; 0, P_i + P_e),
 inside a gate. What is told was partly known before: leaders share process noise and have fused before.
 
-subtraction    Y = P_i^-1 + P_e^-1 - P_0^-1, m+ = m + Y^-1 (P_e^-1 (m_e - m) - P_0^-1 (m_0 - m)) with the prior m_0, P_0
-               of the last fusion (eq. 10, 12): removes what the sender knew then, not what both have learnt alike. Where
-               Y is no covariance, the track keeps its own
+subtraction    Y = P_i^-1 + P_e^-1 - P_0^-1, m+ = m + Y^-1 (P_e^-1 (m_e - m) - P_0^-1 (m_0 - m)), with the prior m_0,
+               P_0 of the last fusion (eq. 10, 12): removes what the sender knew then, not what both have learnt alike.
+               Where Y is not positive definite, a track keeps its own belief
 intersection   Y = a P_i^-1 + (1 - a) P_e^-1 with the a of the largest determinant: a bound whatever is shared
 """
 
@@ -41,8 +41,8 @@ SHARES.flags.writeable = False
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
-    """k hypotheses of one robot relative to the own one: weight (k,), mean (k, L, 4), cov (k, L, 4, 4), known (k,), with
-    layers as of `Tracks`."""
+    """k hypotheses of one robot relative to the own one: weight (k,), mean (k, L, 4), cov (k, L, 4, 4) and known (k,),
+    with layers as of `Tracks`."""
 
     weight: Array
     mean: Array
@@ -65,7 +65,7 @@ def seen_through(leader: Told, told: Told, matched: bool) -> Told:
 
 
 def fused(tracks: Tracks, told: Told, of: int, rules: Rules, by: Fusion, name: int) -> Tracks:
-    """Tracks of one robot, the `of`-th, after what was told of it, pruned; `name` is a free name for what is adopted."""
+    """Tracks of one robot, the `of`-th, after what was told of it, pruned; names from `name` on are free."""
     if not len(told.weight):
         return tracks
     if not len(tracks):

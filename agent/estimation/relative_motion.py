@@ -6,10 +6,10 @@ eq. 5), here as one exact composition:
 
     p' = R(-w_i dt) (p + R(th) v_j dt - v_i dt),   z' = z + (vz_j - vz_i) dt,   th' = th + (w_j - w_i) dt
 
-An error of the yaw rate w_i moves everything at a distance sideways, along l = (y, -x), and turns it at once; it is most
-of the noise. A belief is either linearized, or its moments are matched: a Gaussian heading of variance v turns a vector
-d into E[R(th) d] = exp(-v/2) R(m) d, E cos 2th = exp(-2 v) cos 2m, and covariances with the state follow from expected
-gradients (Stein's lemma), so that mean and covariance are exact however wide the heading is.
+An error of the yaw rate w_i moves everything at a distance sideways, along l = (y, -x), and turns it at once; it is
+most of the noise. A belief is either linearized, or its moments are matched: a Gaussian heading of variance v turns a
+vector d into E[R(th) d] = exp(-v/2) R(m) d, E cos 2th = exp(-2 v) cos 2m, and covariances with the state follow from
+expected gradients (Stein's lemma), so that mean and covariance are exact however wide the heading is.
 
 Places are complex numbers in here, p = x + i y. All arrays broadcast over leading axes.
 """

@@ -161,9 +161,7 @@ def play(
 ) -> Run:
     """A team in a world; `lost` is the share of broadcasts that do not arrive."""
     rng = np.random.default_rng([seed, 1])
-    teams = {
-        robot: Correspondence(settings, [peer for peer in ROBOTS if peer != robot], robot) for robot in LEADERS
-    }
+    teams = {robot: Correspondence(settings, [peer for peer in ROBOTS if peer != robot], robot) for robot in LEADERS}
     pairs = [(leader, peer) for leader in LEADERS for peer in ROBOTS if peer != leader]
     steps = len(made.truth)
     errors, nees = np.full((steps // 2, len(pairs), 4), np.nan), np.full((steps // 2, len(pairs)), np.nan)
@@ -173,9 +171,7 @@ def play(
         motions = {robot: BodyMotion(made.measured[k, j], VELOCITY_COV) for j, robot in enumerate(ROBOTS)}
         scans = {}
         if k % 2 == 1:
-            scans = {
-                robot: scan_of(made, k, ROBOTS.index(robot), detection, clutter, rng) for robot in LEADERS
-            }
+            scans = {robot: scan_of(made, k, ROBOTS.index(robot), detection, clutter, rng) for robot in LEADERS}
         began = time.process_time()
         for robot, own in teams.items():
             own.advance(motions[robot], {peer: motions[peer] for peer in own.peers}, DT)
@@ -228,7 +224,7 @@ def row(runs: list[Run], at_s: tuple[float, ...], which: tuple[str, ...] = ROBOT
             f"{np.median(when):.2f}, {np.percentile(when, 90, method='lower'):.1f}",
             f"{np.sqrt(np.nanmean(place**2)):.2f} ({np.nanmedian(place):.2f})",
             f"{np.degrees(np.sqrt(np.nanmean(turn**2))):.1f} ({np.degrees(np.nanmedian(turn)):.1f})",
-f"{np.nanmedian(nees) / MIDDLE:.2f}",
+            f"{np.nanmedian(nees) / MIDDLE:.2f}",
             f"{made.tracks[: round(5.0 / SCAN_S), chosen].mean():.1f} / {made.tracks[tail, chosen].mean():.1f}",
             f"{1e3 * made.seconds:.2f} ms",
         ]
