@@ -327,7 +327,11 @@ def _fusion(settings: CorrespondenceSettings) -> Fusion:
 
 
 def _rules(settings: CorrespondenceSettings, peers: int) -> Rules:
-    """Published: the printed numbers. Improved: weights of one unit, so that the rest may be pruned late."""
+    """Published: the printed numbers. Improved: weights of one unit, so that the rest may be pruned late.
+
+    What is told outside all gates begins a track only where there is none if published: with the printed weight of a
+    new track, and headings that the inverse linearizes, a leader would forget at each fusion what it knows.
+    """
     single = settings.kind == "nearest"
     improved = settings.form == "improved" and not single
     tuned = improved or single
@@ -340,7 +344,7 @@ def _rules(settings: CorrespondenceSettings, peers: int) -> Rules:
         birth=birth / settings.view_rad2 if improved else birth,
         clutter=others / settings.view_rad2 if improved else 1.0,
         strangeness=STRANGENESS if improved else 1.0,
-        adoption=birth * STRANGENESS if improved else birth,
+        adoption=birth * STRANGENESS if improved else 0.0,
         improved=improved,
         floor=1e-5 if improved else 1e-4,
         depth=20 if improved else 10,

@@ -206,7 +206,7 @@ def test_no_track_begins_from_a_bearing(case: str) -> None:
 def test_a_number_outside_its_gate_costs_a_track_weight_and_moves_nothing() -> None:
     start = tracks_of(0, 0, mean=[[4.0, 1.0, 0.5, 0.3], [9.0, 1.0, 0.5, 0.3]], weight=[0.1, 0.9])
     found, _ = scanned(start, seen_of([0.5], [4.15], np.empty((0, 2))), np.zeros(1, bool), IMPROVED, 10)
-    assert found.weight[0] > 0.7
+    assert found.weight[0] > 5.0 * start.weight[0]
     assert np.array_equal(found.mean[1, 0, :2], [9.0, 1.0])
 
 

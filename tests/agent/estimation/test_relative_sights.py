@@ -56,17 +56,18 @@ def test_jacobians_are_those_of_finite_differences(seed: int) -> None:
 
 
 def test_a_range_is_expected_with_the_mean_and_variance_of_samples() -> None:
-    """A place known ten times less well across than along: linearized, neither would do."""
+    """Of a place that is known well along and badly across, as after many ranges: linearized, neither would do."""
     seed = 3
     rng = np.random.default_rng(seed)
-    x, P = np.array([4.0, 3.0, 1.0, 0.0]), np.diag([0.3, 0.4, 0.2, 0.1])
-    P[0, 1] = P[1, 0] = -0.25
+    x, u = np.array([4.0, 3.0, 1.0, 0.0]), np.array([0.8, 0.6, 0.0, 0.0])
+    P = 0.5 * np.eye(4) - 0.498 * np.outer(u, u)
+    P[2, 2] = 0.01
     r = expected(rng.multivariate_normal(x, P, 400_000))[:, 1]
     second = distance(x, P, zero(r.mean()), zero(), second=True)
     first = distance(x, P, zero(r.mean()), zero(), second=False)
-    assert abs(float(second.residual)) < 0.1 * abs(float(first.residual)), f"seed {seed}"
-    assert float(second.variance) == pytest.approx(float(r.var()), rel=0.05)
-    assert float(first.variance) < 0.8 * float(second.variance)
+    assert abs(float(second.residual)) < 0.2 * abs(float(first.residual)), f"seed {seed}"
+    assert float(second.variance) == pytest.approx(float(r.var()), rel=0.25)
+    assert float(first.variance) < 0.5 * float(second.variance)
 
 
 @given(SEED)
