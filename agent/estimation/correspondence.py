@@ -37,6 +37,9 @@ CONFIRMED, CONFIRMED_RAD, CONFIRMED_S = 0.95, 0.3, 2.0
 DISTINCT = 13.28
 """Mahalanobis square from which on two hypotheses are two modes: 99 % of four degrees of freedom."""
 
+LEAST_CLUTTER = 0.1
+"""False bearings per scan that are expected even of a sensor that is said to have none."""
+
 STRANGENESS = 1.0
 """Density of wrong hypotheses that another leader may tell [1/(m^3 rad)]."""
 
@@ -143,7 +146,7 @@ class Correspondence:
         self.rejected: Counter[str] = Counter()
         self._index = {peer: index for index, peer in enumerate(self.peers)}
         self._fusion = _fusion(settings)
-        self._rules = _rules(settings, len(self.peers))
+        self._rules = _rules(settings)
         self._tracks = no_tracks(self._rules)
         self._name = 1
         self._believed = np.zeros(len(self.peers), dtype=np.int64)
@@ -176,10 +179,7 @@ class Correspondence:
         if self.settings.kind == "nearest":
             self._tracks, self._bad = nearest_track.scanned(self._tracks, self._bad, seen, self._rules)
         else:
-            certain = (
-                self._sure_s >= CONFIRMED_S if self.settings.form == "improved" else np.zeros(len(self.peers), bool)
-            )
-            tracks, self._name = scanned(self._tracks, seen, certain, self._rules, self._name)
+            tracks, self._name = scanned(self._tracks, seen, self._rules, self._name)
             self._tracks = pruned(tracks, self._rules, families=True)
         self._snapshot = None
         self._settle(self._tracks.lineage[:, -2])
@@ -278,7 +278,7 @@ class Correspondence:
                 possible[self._index[peer], row] = True
         (h, h_var), (r, r_var) = numbers
         bearings = np.asarray(scan.bearings, dtype=np.float64).reshape(-1, 2)
-        present = there.any(axis=0)
+        present = np.asarray(there.any(axis=0))
         return Seen(
             h, h_var, there[0], r, r_var, there[1], present, bearings, scan.bearing_cov, possible, labels is not None
         )
@@ -326,7 +326,7 @@ def _fusion(settings: CorrespondenceSettings) -> Fusion:
     return "intersection" if settings.form == "improved" else "subtraction"
 
 
-def _rules(settings: CorrespondenceSettings, peers: int) -> Rules:
+def _rules(settings: CorrespondenceSettings) -> Rules:
     """Published: the printed numbers. Improved: weights of one unit, so that the rest may be pruned late.
 
     What is told outside all gates begins a track only where there is none if published: with the printed weight of a
@@ -337,12 +337,12 @@ def _rules(settings: CorrespondenceSettings, peers: int) -> Rules:
     tuned = improved or single
     birth = settings.birth if settings.birth is not None else (0.005 if tuned else 0.5)
     gate = settings.gate if settings.gate is not None else (0.999 if tuned else 0.95)
-    others = settings.clutter + max(peers - 1, 0) * settings.detection
     return Rules(
         detection=settings.detection,
         gate=gate,
         birth=birth / settings.view_rad2 if improved else birth,
-        clutter=others / settings.view_rad2 if improved else 1.0,
+        clutter=max(settings.clutter, LEAST_CLUTTER) / settings.view_rad2 if improved else 1.0,
+        anywhere=settings.detection / settings.view_rad2,
         strangeness=STRANGENESS if improved else 1.0,
         adoption=birth * STRANGENESS if improved else 0.0,
         improved=improved,

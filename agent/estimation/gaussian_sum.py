@@ -8,11 +8,18 @@ new tracks, for a robot may have been anywhere. Of heights and ranges it is know
     bearing r:            w P_D N(y_r; 0, S) nu_r
     new, from bearing r:  P_B N(h | r sin el, P_zz) nu_r                              (eq. 13)
 
-lambda is the density of bearings that are not the robot's [1/rad^2]: false ones and those of all the others. nu_r is
-what robots of whom there is no doubt leave of a bearing. Each sensor's stage is normalized by itself.
+lambda is the density of bearings that are of nobody [1/rad^2], nu_r what other robots leave of a bearing. Each sensor's
+stage is normalized by itself.
 
-Published: lambda is 1, and a heading that nothing is known of is one Gaussian of variance 4 pi. Improved: the density
-is that of the scan, and a fan of eight headings is begun, each of which can be linearized.
+Published: lambda is 1, and so is nu; a heading that nothing is known of is one Gaussian of variance 4 pi. Improved: a
+fan of eight headings is begun, each of which can be linearized, and a bearing is that of one robot only. With the odds
+e_kr that robot k makes bearing r rather than nobody, e_kr = P_D max N / lambda over its tracks of some weight,
+
+    nu_jr = 1 / (1 + sum_k e_kr / (1 - P_D P_G + sum_s e_ks)),   k other than j, s other than r
+
+as one round of sum-product data association (Williams, Lau 2014), but with what the others may be and not with how
+likely they are it: weights already hold the scans before, and two robots that each believe the other's place would keep
+each other there. Robots that may be in each other's place learn nothing of it from bearings, whoever is not seen.
 
 The tracks of all robots are rows of the same arrays, so that a scan costs the same few calls whatever their number.
 """
@@ -51,6 +58,9 @@ FAN_RAD.flags.writeable = False
 FAN_SIGMA_RAD = 0.47
 PUBLISHED_BIRTH = np.array([0.1, 0.1, 0.05, 4.0 * math.pi])
 """Variances of a new track (eq. 13)."""
+SERIOUS = 1e-2
+"""Only tracks of more weight make a bearing that of their robot rather than another's."""
+
 HEAVY = 1e-3
 """Only tracks of more weight keep a bearing in their gate from beginning a new one."""
 
@@ -60,7 +70,7 @@ class Rules:
     """How sums are formed and pruned.
 
     detection, gate, birth   P_D, P_G, and the weight of a new track beside a sum of 1
-    clutter                  lambda [1/rad^2]
+    clutter, anywhere        lambda, and density of the bearing of a robot without tracks [1/rad^2]
     strangeness, adoption    of told hypotheses: density of those of no track [1/(m^3 rad)], weight of a new track
     improved                 exact moments, second order and fans; else linearized, with the modified gate
     floor, depth, family     least weight of a track; scans after which families are judged; their least weight
@@ -72,6 +82,7 @@ class Rules:
     gate: float
     birth: float
     clutter: float
+    anywhere: float
     strangeness: float
     adoption: float
     improved: bool
@@ -193,13 +204,8 @@ def gate_limit(probability: float, dof: int) -> float:
     return float(chi2.ppf(probability, dof))
 
 
-def scanned(tracks: Tracks, seen: Seen, certain: Mask, rules: Rules, name: int) -> tuple[Tracks, int]:
-    """All tracks after one scan, not pruned, and the next free name (direct fusion).
-
-    certain (n,)   robots of whom there is no doubt: they leave others little of a bearing that is theirs, and nobody
-                   leaves less to them
-    name           first free name of a track
-    """
+def scanned(tracks: Tracks, seen: Seen, rules: Rules, name: int) -> tuple[Tracks, int]:
+    """All tracks after one scan, not pruned, and the next free name, from the first free `name` on (direct fusion)."""
     rest = tracks.rows(~seen.present[tracks.of])
     tracks = tracks.rows(seen.present[tracks.of])
     count = len(tracks)
@@ -217,12 +223,12 @@ def scanned(tracks: Tracks, seen: Seen, certain: Mask, rules: Rules, name: int) 
     residual = residuals(there.expected, seen.bearings)
     d2, likely = squared(residual, there.gate)
     inside = (d2 <= gate_limit(rules.gate, 2)) & seen.possible[tracks.of]
-    found = tracks.weight[:, None] * rules.detection * np.where(inside, likely, 0.0)
+    likely = rules.detection * np.where(inside, likely, 0.0)
+    left = _left_over(tracks, likely, seen, rules)
+    found = tracks.weight[:, None] * likely * left[tracks.of]
     unseen = tracks.weight * rules.missed * rules.clutter
     if seen.certain:
         unseen = np.where(inside.any(axis=1), 0.0, unseen)
-    left = _left_over(tracks.of, found, unseen, certain)
-    found *= left[tracks.of]
     fresh, which, from_bearing = _begun(tracks, seen, inside, left, rules)
 
     row, column = np.nonzero(found)
@@ -259,17 +265,17 @@ def numbered(tracks: Tracks, measured: Scalar, used: Mask, rules: Rules) -> Trac
     return replace(tracks, weight=weight, mean=mean, cov=cov)
 
 
-def _left_over(of: Rows, found: Array, unseen: Array, certain: Mask) -> Array:
-    """nu (n, m): the probability that a bearing is not that of another robot of which there is no doubt."""
-    left = np.ones((len(certain), found.shape[1]))
-    if not certain.any():
-        return left
-    sums = np.zeros((len(certain), found.shape[1]))
-    np.add.at(sums, of, found)
-    total = sums.sum(axis=1) + np.bincount(of, unseen, minlength=len(certain))
-    taken = np.where(certain[:, None], sums / np.where(total > 0.0, total, 1.0)[:, None], 0.0)
-    left[~certain] = np.prod(1.0 - taken, axis=0)
-    return left
+def _left_over(tracks: Tracks, likely: Array, seen: Seen, rules: Rules) -> Array:
+    """nu (n, m), from the densities (h, m) with which tracks make bearings."""
+    if seen.certain or not rules.improved:
+        return np.ones(seen.possible.shape)
+    best = np.zeros(seen.possible.shape)
+    serious = tracks.weight > SERIOUS
+    np.maximum.at(best, tracks.of[serious], likely[serious])
+    best[np.bincount(tracks.of, minlength=len(best)) == 0] = rules.anywhere
+    odds = best / rules.clutter
+    taken = odds / (rules.missed + odds.sum(axis=1, keepdims=True) - odds)
+    return np.asarray(1.0 / (1.0 + taken.sum(axis=0) - taken))
 
 
 def _begun(tracks: Tracks, seen: Seen, inside: Mask, left: Array, rules: Rules) -> tuple[Array, Rows, Rows]:

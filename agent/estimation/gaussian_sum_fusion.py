@@ -6,7 +6,8 @@ inside a gate. What is told was partly known before: leaders share process noise
 subtraction    Y = P_i^-1 + P_e^-1 - P_0^-1, m+ = m + Y^-1 (P_e^-1 (m_e - m) - P_0^-1 (m_0 - m)), with the prior m_0,
                P_0 of the last fusion (eq. 10, 12): removes what the sender knew then, not what both have learnt alike.
                Where Y is not positive definite, a track keeps its own belief
-intersection   Y = a P_i^-1 + (1 - a) P_e^-1 with the a of the largest determinant: a bound whatever is shared
+intersection   Y = a P_i^-1 + (1 - a) P_e^-1 with the a of the largest determinant: a bound whatever is shared. Weights
+               are shared too: they are (w_i w_e)^(1/2) N, so that who hears its own opinion back is no surer of it
 """
 
 from __future__ import annotations
@@ -78,18 +79,21 @@ def fused(tracks: Tracks, told: Told, of: int, rules: Rules, by: Fusion, name: i
     d2 = (white * white).sum(axis=-1)
     scale = np.prod(np.diagonal(root, axis1=-2, axis2=-1), axis=-1) * (2.0 * math.pi) ** 2
     inside = d2 <= gate_limit(rules.gate, 4)
-    found = tracks.weight[:, None] * told.weight * np.where(inside, np.exp(-0.5 * d2) / scale, 0.0)
+    weight, other = tracks.weight, told.weight
+    if by == "intersection":
+        weight, other = np.sqrt(weight), np.sqrt(other)
+    found = weight[:, None] * other * np.where(inside, np.exp(-0.5 * d2) / scale, 0.0)
     strange = ~inside[tracks.weight > HEAVY].any(axis=0)
-    alone = tracks.weight * rules.missed * rules.strangeness
-    new = np.where(strange, told.weight * rules.adoption, 0.0)
+    alone = weight * rules.missed * rules.strangeness
+    new = np.where(strange, other * rules.adoption, 0.0)
     total = found.sum() + alone.sum() + new.sum()
     row, column = np.nonzero(found >= rules.floor * total)
     children = tracks.rows(row)
     if len(row):
         belief = children.mean[:, 0], children.cov[:, 0]
-        other = Told(told.weight[column], told.mean[column], told.cov[column], told.known[column])
+        theirs = Told(told.weight[column], told.mean[column], told.cov[column], told.known[column])
         merge = intersected if by == "intersection" else subtracted
-        both_mean, both_cov = merge(*belief, other)
+        both_mean, both_cov = merge(*belief, theirs)
         mean, cov = children.mean.copy(), children.cov.copy()
         mean[:, 0], cov[:, 0] = both_mean, both_cov
         children = replace(children, weight=found[row, column], mean=mean, cov=cov)

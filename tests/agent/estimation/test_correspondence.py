@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -190,11 +189,9 @@ def test_with_known_identities_hardly_anything_is_wrong() -> None:
     assert run.right(5.0) == 1.0, f"seed {seed}"
 
 
-def test_pods_that_mirror_each_other_keep_two_modes_of_like_weight_and_none_is_confirmed() -> None:
-    """Leaders on the line between them cannot know which is which; the ambiguity says so."""
-    seed = 0
-    run = play(world(seed, 6.0, "mirror"), seed, replace(IMPROVED, clutter=0.0), clutter=0.0)
-    pods = np.array([peer in ("p1", "p2") for _, peer in run.pairs])
-    late = slice(40, None)
-    assert np.median(run.ambiguity[late, pods]) > 0.15, f"seed {seed}"
-    assert np.median(run.weights[late, pods]) < 0.85, f"seed {seed}"
+def test_pods_that_mirror_each_other_are_two_modes_until_they_turn() -> None:
+    """Leaders on the line between them cannot know which is which, and at the beginning the ambiguity says so."""
+    seeds = range(sized(2, 10))
+    made = joined([play(world(seed, 1.0, "mirror"), seed, IMPROVED) for seed in seeds])
+    pods = np.array([peer in ("p1", "p2") for _, peer in made.pairs])
+    assert np.median(made.ambiguity[:4, pods] / made.weights[:4, pods]) > 0.2, f"seeds {seeds}"

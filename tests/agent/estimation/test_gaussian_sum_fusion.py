@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
 from agent.estimation.gaussian_sum import Rules, Tracks, no_tracks
-from agent.estimation.gaussian_sum_fusion import Told, fused, intersected, seen_back, seen_through, subtracted
+from agent.estimation.gaussian_sum_fusion import Fusion, Told, fused, intersected, seen_back, seen_through, subtracted
 from agent.estimation.relative_motion import composed, inverted
 from tests.agent.estimation.test_gaussian_sum import IMPROVED, tracks_of
 from tests.agent.estimation.test_intersection import joint_of, random_correlation
@@ -98,24 +98,45 @@ def test_hypotheses_come_into_the_own_frame_by_inverse_and_by_all_pairs_of_weigh
     assert np.allclose(through.mean[2, 0], mean) and np.allclose(through.cov[2, 0], cov)
 
 
-def test_weights_after_fusion_are_those_of_an_enumeration() -> None:
+@pytest.mark.parametrize("by", ["intersection", "subtraction"])
+def test_weights_after_fusion_are_those_of_an_enumeration(by: Fusion) -> None:
+    """An intersection takes the geometric mean of both opinions, a subtraction their product."""
+    rules = replace(RULES, layers=2)
     own = tracks_of(0, 0, mean=[[4.0, 1.0, 0.5, 0.3], [-4.0, 2.0, 0.5, -2.0]], weight=[0.4, 0.6])
+    own = replace(own, mean=np.repeat(own.mean, 2, axis=1), cov=np.repeat(own.cov, 2, axis=1))
     cov = np.diag([0.1, 0.1, 0.01, 0.05])
     told = told_of(np.array([[4.2, 1.1, 0.52, 0.2], [9.0, 9.0, 0.5, 0.0]]), np.stack([cov, cov]), [0.8, 0.2])
-    found = fused(own, told, 0, RULES, "intersection", 77)
+    told = replace(told, mean=np.repeat(told.mean, 2, axis=1), cov=np.repeat(told.cov, 2, axis=1))
+    found = fused(own, told, 0, rules, by, 77)
     missed = (1.0 - RULES.detection * RULES.gate) * RULES.strangeness
     match = multivariate_normal(np.zeros(4), own.cov[0, 0] + cov).pdf(apart(told.mean[0, 0], own.mean[0, 0]))
-    weights = np.array([0.4 * 0.8 * match + 0.4 * missed, 0.6 * missed, 0.005 * 0.2])
-    assert len(found) == 3
-    assert found.weight == pytest.approx(weights / weights.sum(), rel=1e-6)
-    assert found.mean[2, 0, 0] == 9.0 and found.lineage[2, -1] == 77 and not found.known[2]
+    one, other, near, far = np.array([0.4, 0.6, 0.8, 0.2]) ** (0.5 if by == "intersection" else 1.0)
+    weights = np.array([one * near * match, one * missed, other * missed, 0.005 * far])
+    adopted = found.mean[:, 0, 0] == 9.0
+    away = found.mean[:, 0, 0] == -4.0
+    assert found.weight[away] == pytest.approx([weights[2] / weights.sum()], rel=1e-6)
+    assert found.weight[adopted] == pytest.approx([weights[3] / weights.sum()], rel=1e-6)
+    assert found.weight[~adopted & ~away].sum() == pytest.approx(weights[:2].sum() / weights.sum(), rel=1e-6)
+    assert found.lineage[adopted, -1].tolist() == [77] and not found.known[adopted].any()
+
+
+def test_hearing_one_s_own_opinion_back_makes_nobody_surer_of_it() -> None:
+    mean = np.array([[4.0, 1.0, 0.5, 0.3], [-4.0, 2.0, 0.5, -2.0]])
+    own = tracks_of(0, 0, mean=mean, weight=[0.4, 0.6])
+    found = own
+    for _ in range(5):
+        found = fused(found, told_of(found.mean[:, 0], found.cov, found.weight), 0, RULES, "intersection", 9)
+    assert np.sort(found.weight) == pytest.approx([0.4, 0.6], abs=0.01)
+    assert np.allclose(np.sort(found.mean[:, 0, 0]), [-4.0, 4.0]) and np.allclose(
+        found.cov[:, 0], own.cov[0, 0], rtol=0.1
+    )
 
 
 @pytest.mark.parametrize("by", ["intersection", "subtraction"])
-def test_a_leader_without_tracks_adopts_what_it_hears_and_nothing_changes_if_it_hears_nothing(by: str) -> None:
+def test_a_leader_without_tracks_adopts_what_it_hears_and_nothing_changes_if_it_hears_nothing(by: Fusion) -> None:
     layers: Rules = replace(RULES, layers=2)
     told = with_past(np.array([4.0, 1.0, 0.5, 0.3]), np.eye(4), np.zeros(4), np.eye(4))
-    found: Tracks = fused(no_tracks(layers), told, 3, layers, by, 5)  # type: ignore[arg-type]
+    found: Tracks = fused(no_tracks(layers), told, 3, layers, by, 5)
     assert found.of.tolist() == [3] and found.weight.tolist() == [1.0] and np.array_equal(found.mean, told.mean)
     nothing = Told(np.empty(0), np.empty((0, 2, 4)), np.empty((0, 2, 4, 4)), np.empty(0, dtype=np.bool_))
-    assert fused(found, nothing, 3, layers, by, 6) is found  # type: ignore[arg-type]
+    assert fused(found, nothing, 3, layers, by, 6) is found
