@@ -293,7 +293,8 @@ class Correspondence:
                 known = told.prior_known
             else:
                 mean, cov = np.repeat(mean, 2, axis=1), np.repeat(cov, 2, axis=1)
-        finite = np.isfinite(mean).all(axis=(1, 2)) & np.isfinite(cov).all(axis=(1, 2, 3)) & (told.weights > 0.0)
+        finite = np.isfinite(mean).all(axis=(1, 2)) & np.isfinite(cov).all(axis=(1, 2, 3))
+        finite &= (told.weights > 0.0) & (told.weights <= 1.0 + 1e-6)
         sane = finite.copy()
         sane[finite] = (np.linalg.eigvalsh(cov[finite])[..., 0] > 0.0).all(axis=1)
         if not sane.all():

@@ -139,9 +139,10 @@ def test_rubbish_that_is_told_is_counted_and_changes_nothing() -> None:
     before = leader.told("a")
     bad = np.array([[math.nan, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]])
     leader.fuse("a", {"me": Hypotheses(np.ones(2), bad, np.stack([np.eye(4), -np.eye(4)]))})
+    leader.fuse("a", {"me": Hypotheses(np.array([math.inf]), np.zeros((1, 4)), np.eye(4)[None])})
     leader.fuse("a", {"stranger": before})
     leader.fuse("stranger", {"me": before})
-    assert leader.rejected == {"no_belief": 2, "unknown_robot": 2}
+    assert leader.rejected == {"no_belief": 3, "unknown_robot": 2}
     assert np.array_equal(leader.told("a").means, before.means)
 
 
