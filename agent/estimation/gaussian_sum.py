@@ -58,7 +58,7 @@ FAN_RAD.flags.writeable = False
 FAN_SIGMA_RAD = 0.47
 PUBLISHED_BIRTH = np.array([0.1, 0.1, 0.05, 4.0 * math.pi])
 """Variances of a new track (eq. 13)."""
-SERIOUS = 1e-2
+SERIOUS = 3e-3
 """Only tracks of more weight make a bearing that of their robot rather than another's."""
 
 HEAVY = 1e-3
