@@ -40,7 +40,7 @@ PROTECTED = UnsafeSettings()
 
 
 class LocalizationPart(Part):
-    kind: Literal["clat", "replica", "jlatt", "fixed"] = "clat"
+    kind: Literal["clat", "replica", "jlatt", "fixed", "relative"] = "clat"
     form: Literal["auto", "split_joint", "safe", "published", "joint"] = "auto"
     transform: Literal["unscented", "linearized", "jacobian"] | None = None
     correlation: Literal["factors", "ignored"] = "factors"
@@ -59,8 +59,8 @@ class LocalizationPart(Part):
         """
         if self.kind != "jlatt":
             self._refuse("weights", "jlatt", f"kind '{self.kind}' has no rounds")
-        if self.kind == "fixed":
-            self._refuse("innovation_cap", "clat", "kind 'fixed' has no innovations")
+        if self.kind in ("fixed", "relative"):
+            self._refuse("innovation_cap", "clat", f"kind '{self.kind}' has no innovations of poses")
         if self.kind != "clat":
             for key in ("form", "correlation", "pair_interval_s"):
                 self._refuse(key, "clat", f"kind '{self.kind}' has no contacts of pairs")

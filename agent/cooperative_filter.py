@@ -7,7 +7,7 @@ Instants may lie in the past of the filter's own: late data are used or counted,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,4 +137,13 @@ class CooperativeFilter(Protocol):
 
     def saved(self) -> Saved | None:
         """What another filter of the form can begin with; None: nothing."""
+        ...
+
+
+@runtime_checkable
+class AnonymousFilter(Protocol):
+    """A filter that also takes measurements of others whose names nobody knows."""
+
+    def anonymous(self, t_ns: int, event: Observation) -> None:
+        """Use a measurement of somebody."""
         ...

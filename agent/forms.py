@@ -13,6 +13,7 @@ from agent.fixed_filter import FixedFilter
 from agent.health import Health
 from agent.jlatt_filter import JlattFilter
 from agent.joint_filter import JointFilter
+from agent.relative_filter import RelativeFilter
 from agent.replica_filter import ReplicaFilter
 from agent.saved_state import Saved, SavedFactors, SavedSplit
 from agent.settings import AgentSettings
@@ -48,6 +49,8 @@ def _localizing(
 ) -> CooperativeFilter:
     if settings.localization.kind == "fixed" and settings.source == "survey":
         return FixedFilter(settings, counters, saved if isinstance(saved, SavedSplit) else None)
+    if settings.localization.kind == "relative" and settings.source == "survey":
+        return RelativeFilter(settings, counters, saved if isinstance(saved, SavedSplit) else None)
     if isinstance(saved, SavedFactors):
         kept = JointFilter if settings.localization.form == "joint" else FactorFilter
         return kept(settings, counters, count_nis, saved, health=health)

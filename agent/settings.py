@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.correspondence import CorrespondenceSettings
 from agent.estimation.intersection import Weight
 from agent.estimation.motion import PLANAR_MOTION, RobotMotion, StateLayout, TargetMotion
 from agent.estimation.unscented import DEFAULT, Transform, UnscentedParameters
@@ -29,7 +30,8 @@ def nanoseconds(seconds: float) -> int:
 @dataclass(frozen=True, slots=True)
 class LocalizationSettings:
     """Cooperative localization: `clat`, by contacts of pairs; `replica`, by raw data told to the whole team;
-    `jlatt`, by rounds in which neighbours tell their beliefs; `fixed`, not at all: the pose is what fixes say.
+    `jlatt`, by rounds in which neighbours tell their beliefs; `fixed`, not at all: the pose is what fixes say;
+    `relative`, as `fixed`, and others are located relative to the own body (`RelativeSettings`).
 
     weights                           how `jlatt` weighs what may be correlated
     sighting_weight / fusion_weight   how intersections choose their weight
@@ -39,7 +41,7 @@ class LocalizationSettings:
     max_lines                         identity lines kept per peer
     """
 
-    kind: Literal["clat", "replica", "jlatt", "fixed"] = "clat"
+    kind: Literal["clat", "replica", "jlatt", "fixed", "relative"] = "clat"
     form: Literal["auto", "split_joint", "safe", "published", "joint"] = "auto"
     transform: Transform = "unscented"
     correlation: Literal["factors", "ignored"] = "factors"
@@ -232,6 +234,24 @@ class TargetSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class RelativeSettings:
+    """How a robot of the kind `relative` locates others relative to its own body.
+
+    peers              the others; nobody else counts
+    leads              it has a camera that sees others, and finds out where they are; else it only tells how it moves
+    known              the camera knows whom it sees; else it does not, and `correspondence` says how that is found out
+    acceleration_mps2, turn_acceleration_radps2  how the velocity of a peer that is not heard may change (1 sigma)
+    """
+
+    peers: tuple[str, ...] = ()
+    leads: bool = False
+    known: bool = False
+    correspondence: CorrespondenceSettings = field(default_factory=CorrespondenceSettings)
+    acceleration_mps2: float = 1.0
+    turn_acceleration_radps2: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
 class TrackEnd:
     """When a track ends: nothing learnt for `after_ns`, or a position deviation above `above_m`; None: never."""
 
@@ -280,6 +300,7 @@ class AgentSettings:
     unsafe: UnsafeSettings = UnsafeSettings()
     track: bool = True
     tracking: TrackingSettings = TrackingSettings()
+    relative: RelativeSettings = RelativeSettings()
     team: tuple[TeamMember, ...] = ()
     track_end: TrackEnd = TrackEnd()
     track_within_m: float | None = None

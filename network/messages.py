@@ -12,6 +12,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from network.relative_messages import HypothesesReport, MotionReport
+
 Array = NDArray[np.float64]
 
 SCHEMA = 1
@@ -423,6 +425,8 @@ Body = (
     | TeamReport
     | RoundReport
     | BearingReport
+    | MotionReport
+    | HypothesesReport
 )
 
 
