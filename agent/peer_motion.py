@@ -75,8 +75,8 @@ class PeerMotion:
 
     def over(self, t0_ns: int, t_ns: int) -> tuple[BodyMotion, bool]:
         """Mean velocity from t0_ns to t_ns, and whether some of it is a guess."""
-        total, total_cov, guessed, pieces = STILL, np.zeros((4, 4)), False, 0
-        for begin_ns, end_ns, stretch in self._cut(t0_ns, t_ns):
+        total, total_cov, guessed = STILL, np.zeros((4, 4)), False
+        for index, (begin_ns, end_ns, stretch) in enumerate(self._cut(t0_ns, t_ns)):
             dt_s = (end_ns - begin_ns) * 1e-9
             if stretch is not None:
                 # White noise: the shorter the part, the larger the variance of its mean.
@@ -85,8 +85,7 @@ class PeerMotion:
             else:
                 delta, cov = self._guess(begin_ns, end_ns)
                 guessed = True
-            total, total_cov = extended(total, total_cov, delta, cov) if pieces else (delta, cov)
-            pieces += 1
+            total, total_cov = extended(total, total_cov, delta, cov) if index else (delta, cov)
         dt_s = (t_ns - t0_ns) * 1e-9
         cov = total_cov / dt_s**2 + LEAST_VARIANCE * np.eye(4)
         return BodyMotion(total / dt_s, cov), guessed

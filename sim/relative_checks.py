@@ -10,7 +10,7 @@ from sim.scenario import RobotPart, Scenario, SensorPart, sensor_kind
 
 
 def check_relative(scenario: Scenario) -> None:
-    """Raises `ConfigError` for a fleet of the kind `relative` that lacks something, and for keys only that kind uses."""
+    """Raises `ConfigError` for a fleet of the kind `relative` that lacks something, and for keys only it uses."""
     leaders = 0
     for robot in scenario.robots:
         where = f"{scenario.name}: robots.{robot.id}"
