@@ -149,7 +149,7 @@ class Leader:
 
     def heard_motion(self, peer: str, stretch: Stretch, altitude: Altitude | None) -> None:
         """How a peer moved; it is one of the peers."""
-        if stretch.t_ns <= self.t_ns - self._tolerance_ns:
+        if stretch.t_ns <= self.t_ns + self._tolerance_ns:
             self._counters["motion.late"] += 1
         if not self._motions[peer].add(stretch):
             self._counters["motion.known"] += 1

@@ -160,7 +160,8 @@ def _gaussians(rows: Array) -> tuple[Array, Array]:
 
 def sendable(cov: Array) -> bool:
     """Whether a covariance (4, 4) is one in single precision too."""
-    single = cov.astype(np.float32).astype(np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        single = cov.astype(np.float32).astype(np.float64)
     root, info = dpotrf(single, lower=1)
     return bool(np.isfinite(single).all() and info == 0 and root.diagonal().min() ** 2 >= BELIEF_FLOOR)
 

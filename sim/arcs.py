@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.config_file import ConfigError, Finite, NotNegative, Part, Positive
+from agent.config_file import ConfigError, Finite, Id, NotNegative, Part, Positive, Vector2
 from agent.estimation.gaussian import wrap
 from sim.noise import generator
 
@@ -34,21 +34,23 @@ class ArcPart(Part):
     with `as_of` is what is drawn for that one.
     """
 
-    speed_mps: tuple[NotNegative, NotNegative] = (0.4, 0.8)
-    turn_radps: tuple[NotNegative, NotNegative] = (0.1, 0.25)
-    side: float | None = None
-    climb_mps: tuple[NotNegative, NotNegative] = (0.1, 0.3)
+    speed_mps: Vector2 = [0.4, 0.8]
+    turn_radps: Vector2 = [0.1, 0.25]
+    side: Finite | None = None
+    climb_mps: Vector2 = [0.1, 0.3]
     wave_radps: NotNegative = 0.5
     turns_from_s: NotNegative = 0.0
-    as_of: str | None = None
+    as_of: Id | None = None
     kidnapped: KidnapPart | None = None
 
     def check(self) -> None:
         """Raises `ConfigError` for bounds the wrong way round, or a side that is none."""
         for key in ("speed_mps", "turn_radps", "climb_mps"):
             low, high = getattr(self, key)
-            if low > high:
-                raise ConfigError(f"arc.{key} = [{low:g}, {high:g}] is empty; the lower bound comes first")
+            if not 0.0 <= low <= high:
+                raise ConfigError(
+                    f"arc.{key} = [{low:g}, {high:g}] is no span; neither bound is below 0, and the lower one comes first"
+                )
         if self.side not in (None, 1.0, -1.0):
             raise ConfigError(f"arc.side = {self.side:g} is none; 1 is to the left, -1 to the right")
 
