@@ -92,6 +92,7 @@ class RelativeFilter:
         unsure = "".join(
             f"; {item.peer} ambiguous ({item.ambiguity:.2f})" for item in found if item.ambiguity >= AMBIGUOUS
         )
+        unsure += "".join(f"; {peer} not heard" for peer in self._leader.unheard())
         confirmed = sum(item.confirmed for item in found)
         return f"relative, {kind}", f"{confirmed} of {len(relative.peers)} identified{unsure}"
 

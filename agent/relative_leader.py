@@ -31,6 +31,10 @@ Array = NDArray[np.float64]
 PATIENCE_NS = NS
 """A peer that has told nothing of its motion for so long is not waited for."""
 
+SILENT_NS = 3 * NS
+"""Of a peer that has told nothing of its motion for so long nobody says where it is: hypotheses that are moved by
+guesses alone fit whatever is measured."""
+
 FRESH_NS = NS // 5
 """An altitude that is older than that is not compared with another one."""
 
@@ -276,7 +280,7 @@ class Leader:
         self._counters["round.skipped"] += self._clock.open(due_ns)
         self._open_ns, self._closes_ns = due_ns, now_ns + self._wait_ns
         subjects = []
-        for peer in self._peers:
+        for peer in self._heard_of():
             part, left_out = sendable_part(peer, self.correspondence.told(peer))
             self._counters["hypotheses.unsendable"] += left_out
             if part is not None:
@@ -320,10 +324,21 @@ class Leader:
 
     # -- what is known --------------------------------------------------------------------------------------
 
+    def _heard_of(self) -> list[str]:
+        """Peers that have told lately how they move."""
+        unheard = self.unheard()
+        return [peer for peer in self._peers if peer not in unheard]
+
+    def unheard(self) -> list[str]:
+        """Peers that are known to be there, and have told nothing of their motion lately, or ever."""
+        oldest_ns = self.t_ns - SILENT_NS
+        ends = ((peer, motion.end_ns) for peer, motion in self._motions.items())
+        return [peer for peer, end_ns in ends if end_ns is None or end_ns < oldest_ns]
+
     def relatives(self) -> tuple[RelativeEstimate, ...]:
         """The hypothesis that is believed of each peer there is one of."""
         found = []
-        for peer in self._peers:
+        for peer in self._heard_of():
             best = self.correspondence.dominant(peer)
             if best is not None:
                 found.append(

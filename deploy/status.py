@@ -298,7 +298,7 @@ def print_summary(summary: dict[str, Any], run_dir: Path, report: Path | None) -
     relative = summary.get("relative")
     if relative is not None:
         console.print(
-            f"relative: {_number(100.0 * relative['identified_share'][-1][1], 0)} % identified at the end, half of them "
+            f"relative: {_number(100.0 * relative['identified_share'][-1][1], 0)} % identified at the end, half "
             f"after {_number(relative['time_to_identify_s']['median'], 1)} s; position RMSE "
             f"{_number(relative['position_rmse_m'], 2)} m (median {_number(relative['position_error_median_m'], 2)}), "
             f"ANEES {_number(relative['anees_median'], 2)}"

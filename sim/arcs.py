@@ -49,7 +49,7 @@ class ArcPart(Part):
             low, high = getattr(self, key)
             if not 0.0 <= low <= high:
                 raise ConfigError(
-                    f"arc.{key} = [{low:g}, {high:g}] is no span; neither bound is below 0, and the lower one comes first"
+                    f"arc.{key} = [{low:g}, {high:g}] is no span; state two bounds, not below 0, the lower one first"
                 )
         if self.side not in (None, 1.0, -1.0):
             raise ConfigError(f"arc.side = {self.side:g} is none; 1 is to the left, -1 to the right")

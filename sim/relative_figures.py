@@ -141,9 +141,9 @@ def reduce_relatives(t_s: Array, traces: dict[Pair, RelativeTrace], inside: NDAr
 def combine_relatives(trials: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Figures over pairs and trials, in the order of the trials.
 
-    `identified_share` is the share of pairs that are right at each instant [s]; `time_to_identify_s` is over pairs, null
-    where that many are never identified. Errors and the rest are of the window. `anees_median` is the median NEES over
-    that of an honest filter: a mean would only show the wrong hypotheses.
+    `identified_share` is the share of pairs that are right at each instant [s]; `time_to_identify_s` is over pairs,
+    null where that many are never identified. Errors and the rest are of the window. `anees_median` is the median NEES
+    over that of an honest filter: a mean would only show the wrong hypotheses.
     """
     share = np.mean([trial["right"] for trial in trials], axis=0)
     times = np.array([np.inf if t is None else t for trial in trials for t in trial["identified_s"]])

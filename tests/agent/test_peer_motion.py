@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -68,7 +70,7 @@ def test_who_falls_silent_goes_on_as_before_and_less_and_less_is_known() -> None
 def test_how_often_a_gap_is_cut_does_not_matter(cuts: int) -> None:
     told, edges = peer(1), np.linspace(STEP, STEP + 2 * NS, cuts + 1).astype(int).tolist()
     way = 0.0
-    for begin, end in zip(edges, edges[1:]):
+    for begin, end in pairwise(edges):
         motion, _ = told.over(begin, end)
         way += motion.cov[2, 2] * ((end - begin) * 1e-9) ** 2
     most = np.hypot(abs(VELOCITY[2]), COAST.speed_mps)

@@ -14,12 +14,12 @@ from sim.scenario_file import load
 from sim.trial import run_trial
 from tests.sizes import sized
 
-SECONDS = 6.0
+SECONDS = 5.0
 SEEDS = range(1, sized(2, 25) + 1)
 
 
 def fleet(*overrides: str, name: str = "correspondence", seconds: float = SECONDS) -> Scenario:
-    return load(name, [f"duration_s={seconds}", f"window_s=[3.0, {seconds}]", *overrides])
+    return load(name, [f"duration_s={seconds}", f"window_s=[{min(3.0, 0.5 * seconds)}, {seconds}]", *overrides])
 
 
 def figures(results: list[TrialResult]) -> dict[str, object]:
@@ -50,8 +50,9 @@ def test_leaders_find_out_where_everybody_is() -> None:
     assert found["anees_median"] <= 1.3, shown(found)  # type: ignore[operator]
     assert found["lag_median_s"] == 0.0
     for result in results:
-        assert sorted(result.trace.relatives) == [(one, other) for one in ("l1", "l2") for other in
-                                                  sorted({"l1", "l2", "p1", "p2", "p3"} - {one})]
+        assert sorted(result.trace.relatives) == [
+            (one, other) for one in ("l1", "l2") for other in ("l1", "l2", "p1", "p2", "p3") if one != other
+        ]
         counters = result.counters["l1"]
         assert counters["round.closed"] >= SECONDS - 1 and counters["hypotheses.used"] > 4 * (SECONDS - 2)
         assert not counters.get("motion.guessed", 0) > 10
@@ -60,18 +61,18 @@ def test_leaders_find_out_where_everybody_is() -> None:
 
 
 def test_names_help() -> None:
-    known = ("correspondence.kind=known", "robots.l1.sensors.camera={anonymous=false, clutter=0.0}")
     scenario = fleet()
     robots = []
     for robot in scenario.robots:
         sensors = {
-            name: sensor.model_copy(update={"anonymous": False, "clutter": 0.0}) for name, sensor in robot.sensors.items()
+            name: sensor.model_copy(update={"anonymous": False, "clutter": 0.0})
+            for name, sensor in robot.sensors.items()
         }
         robots.append(robot.model_copy(update={"sensors": sensors}))
     part = scenario.correspondence.model_copy(update={"kind": "known"})
     scenario = scenario.model_copy(update={"robots": robots, "correspondence": part})
-    found = figures([run_trial(scenario, seed) for seed in SEEDS])
-    assert found["identified_share"][-1][1] >= 0.9, (known, shown(found))  # type: ignore[index]
+    found = figures([run_trial(scenario, seed) for seed in SEEDS[: sized(1, 25)]])
+    assert found["identified_share"][-1][1] >= 0.9, shown(found)  # type: ignore[index]
 
 
 def test_lost_and_late_messages_cost_something_and_break_nothing() -> None:
@@ -81,20 +82,27 @@ def test_lost_and_late_messages_cost_something_and_break_nothing() -> None:
     assert found["anees_median"] <= 1.5, shown(found)  # type: ignore[operator]
     assert 0.0 < found["lag_median_s"] < 0.35, shown(found)  # type: ignore[operator]
     guessed = [result.counters["l1"]["motion.guessed"] for result in results]
-    assert min(guessed) > 50, guessed
+    assert min(guessed) > 40, guessed
 
 
-def test_without_each_other_leaders_still_find_out() -> None:
-    """No message arrives: peers are taken to stand about, and the claims grow with that."""
-    results, found = played("links.loss=1.0", seconds=4.0)
-    assert not any(result.counters["l1"]["hypotheses.used"] for result in results)
-    assert found["anees_median"] is None or found["anees_median"] <= 1.5, shown(found)  # type: ignore[operator]
+def test_without_each_other_leaders_still_find_the_pods() -> None:
+    """Messages between leaders are lost: the pods still tell how they move; the other leader is not claimed."""
+    cut = 'faults=[{kind="partition", sources=["l1", "l2"], destinations=["l1", "l2"], at_s=0.0}]'
+    results, _ = played(cut, seconds=4.0)
+    for result in results:
+        assert not result.counters["l1"].get("hypotheses.used")
+        assert sorted(result.trace.relatives) == [(one, pod) for one in ("l1", "l2") for pod in ("p1", "p2", "p3")]
+
+
+def test_who_hears_nobody_claims_nothing() -> None:
+    result = run_trial(fleet("links.loss=1.0", seconds=2.0), 1)
+    assert result.trace.relatives == {} and result.counters["l1"]["motion.guessed"] >= 100
 
 
 @pytest.mark.parametrize("keep_state", [False, True])
 def test_a_leader_that_begins_again_finds_out_again(keep_state: bool) -> None:
-    keeps = "true" if keep_state else "false"
-    crash = f'faults=[{{kind="crash", robot="l1", at_s=2.0, for_s=1.0, keep_state={keeps}}}]'
+    keeps = "kept" if keep_state else "lost"
+    crash = f'faults=[{{kind="crash", robot="l1", at_s=2.0, for_s=1.0, state="{keeps}"}}]'
     seconds = 8.0
     result = run_trial(fleet(crash, seconds=seconds), 3, checker=InvariantChecker(3))
     t_s = result.trace.t_s
@@ -110,19 +118,25 @@ def test_a_leader_that_begins_again_finds_out_again(keep_state: bool) -> None:
 def test_a_pod_that_falls_silent_is_lost_slowly() -> None:
     robots = VirtualFleet(fleet(seconds=8.0), 2, False)
     robots.run_until(4.0)
-    robots.isolate("p1") if hasattr(robots, "isolate") else robots.partition(["p1"], ["l1", "l2", "p2", "p3"])
+    before = robots.status("l1")["relatives"]["p1"]["sigma_m"]
+    robots.partition(["p1"], ["l1", "l2", "p2", "p3"])
+    robots.run_until(6.5)
+    assert robots.status("l1")["relatives"]["p1"]["sigma_m"] > before
     robots.run_until(8.0)
-    counters = robots.status("l1")["counters"]
-    assert counters["motion.guessed"] >= 70
-    assert counters["relative.scans"] >= 78
+    status = robots.status("l1")
+    assert "p1" not in status["relatives"] and "p1 not heard" in status["form_reason"]
+    assert {"l2", "p2", "p3"} <= status["relatives"].keys()
 
 
-def test_mirrored_pods_stay_ambiguous_until_they_turn() -> None:
+def test_mirrored_pods_are_taken_for_each_other_at_most() -> None:
+    """Nothing tells which one is which: each of them is taken to be where one of both is."""
     result = run_trial(fleet(name="correspondence-symmetric", seconds=5.0), 1)
-    for pod in ("p1", "p2"):
-        trace = result.trace.relatives["l1", pod]
-        # Nobody can tell them apart, and what is believed says so.
-        assert np.nanmean(trace.ambiguity[result.trace.t_s >= 3.0]) > 0.2, pod
+    late, seen = result.trace.t_s >= 3.0, result.trace.relatives
+    for leader in ("l1", "l2"):
+        places = [seen[leader, pod].truth[late, :3] for pod in ("p1", "p2")]
+        for pod in ("p1", "p2"):
+            away = [np.linalg.norm(seen[leader, pod].mean[late, :3] - place, axis=1) for place in places]
+            assert np.median(np.min(away, axis=0)) < 0.5, (leader, pod)
 
 
 def test_equal_seeds_give_equal_runs() -> None:
