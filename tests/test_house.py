@@ -55,6 +55,7 @@ CONFIG_ONLY = (
     "agent/config_parts.py",
     "agent/fault_parts.py",
     "agent/planning_parts.py",
+    "agent/relative_parts.py",
     "agent/start_config.py",
     "sim/scenario.py",
 )
