@@ -119,7 +119,7 @@ def reduce_relatives(t_s: Array, traces: dict[Pair, RelativeTrace], inside: NDAr
 
     def within(values: list[Array]) -> Array:
         found = np.concatenate([item[inside] for item in values])
-        return found[np.isfinite(found)]
+        return np.asarray(found[np.isfinite(found)])
 
     items = list(traces.values())
     ambiguity = within([item.ambiguity for item in items])
