@@ -7,11 +7,13 @@ import pytest
 
 from deploy.fleet import VirtualFleet
 from sim.engine import TrialResult
+from sim.fault_plan import trial_faults
+from sim.faulty_world import FaultyWorld
 from sim.invariants import InvariantChecker
 from sim.relative_figures import combine_relatives, place_errors, reduce_relatives
 from sim.scenario import Scenario
 from sim.scenario_file import load
-from sim.trial import run_trial
+from sim.trial import open_world, run_trial
 from tests.sizes import sized
 
 SECONDS = 5.0
@@ -144,3 +146,16 @@ def test_equal_seeds_give_equal_runs() -> None:
     for key, trace in one.trace.relatives.items():
         assert np.array_equal(trace.mean, other.trace.relatives[key].mean, equal_nan=True)
         assert np.array_equal(trace.cov, other.trace.relatives[key].cov, equal_nan=True)
+
+
+def test_a_camera_that_loses_half_loses_each_bearing_by_itself() -> None:
+    lossy = 'faults=[{kind="sensor_dropout", robot="l1", sensor="camera", share=0.5, at_s=0.0, for_s=2.0}]'
+    scenario = fleet(lossy, seconds=2.0)
+    world = FaultyWorld(open_world(scenario, 1), 1, {robot.id: None for robot in scenario.robots})
+    for name, fault in trial_faults(scenario, 1).items():
+        world.add(name, fault)
+    counts = []
+    for k in range(1, world.steps + 1):
+        counts.append(sum(item.robot == "l1" and item.sensor == "camera" for item in world.outputs(k)))
+    seen = np.array(counts)[1::2]
+    assert 1.5 < seen.mean() < 3.3 and (seen == 0).mean() < 0.3, seen
