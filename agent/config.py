@@ -48,6 +48,7 @@ from agent.leader_parts import check_lateness
 from agent.mavlink_endpoint import MavlinkEndpointError, parse_endpoint
 from agent.motion_parts import OdometryPart
 from agent.planning_parts import PlanningPart, RoundPart
+from agent.relative_parts import CAMERAS, AgentCorrespondencePart, check_altitude, check_leader
 from agent.sensor_input import SensorConfig
 from agent.settings import AgentSettings, nanoseconds
 from agent.start_config import InitialPart, check_start
@@ -180,6 +181,7 @@ class AgentConfig(Part):
     motion: MotionPart = MotionPart()
     localization: LocalizationPart = LocalizationPart()
     tracking: TrackingPart = TrackingPart()
+    correspondence: AgentCorrespondencePart = AgentCorrespondencePart()
     lateness: LatenessPart = LatenessPart()
     health: HealthPart = HealthPart()
     round: RoundPart = RoundPart()
@@ -244,11 +246,16 @@ class AgentConfig(Part):
             coast=coast,
             track=self.tracking.kind != "none",
             tracking=self.tracking.settings(),
+            relative=self.correspondence.settings(self.correspondence.peers, self.leads()),
             team=tuple(member.settings() for member in self.team),
             track_end=self.tracking.end(),
             track_within_m=self.tracking.start_within_m,
             persist_ns=nanoseconds(self.state.interval_s),
         )
+
+    def leads(self) -> bool:
+        """Whether it has a camera that sees others."""
+        return any(part.kind in CAMERAS for part in self.sensors.values())
 
     def sensor_configs(self) -> dict[str, SensorConfig]:
         return {name: part.settings() for name, part in self.sensors.items()}
@@ -290,6 +297,10 @@ def load_agent_config(path: Path) -> AgentConfig:
             check_room(LAYOUTS[config.motion.model], [(target.id, LAYOUTS[target.model]) for target in followed])
     except ConfigError as error:
         raise ConfigError(f"{path}: localization: {error}") from None
+    try:
+        _check_relative(config)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
     try:
         for member in config.team:
             member.settings()
@@ -348,3 +359,21 @@ def load_agent_config(path: Path) -> AgentConfig:
             "remove it, or declare the autopilot with mavlink.simulated = true on loopback"
         )
     return config
+
+
+def _check_relative(config: AgentConfig) -> None:
+    """What the kind `relative` needs is there, and nothing of it for another kind. Raises `ConfigError`."""
+    config.correspondence.check(config.localization, config.motion.model)
+    config.correspondence.check_peers(config.identity.robot, config.localization)
+    if config.localization.kind != "relative":
+        return
+    kinds = {name: str(part.kind) for name, part in config.sensors.items()}
+    fixes = () if config.mavlink is None else tuple(config.mavlink.fixes)
+    check_altitude(kinds, fixes)
+    check_leader(kinds)
+    for name, part in config.sensors.items():
+        if part.kind in CAMERAS and any(mount_of(part.mount)[:3]):
+            raise ConfigError(
+                f"sensors.{name}.mount: localization.kind = 'relative' takes a camera to sit at the body's origin; "
+                "state angles only, and let the origin be there"
+            )

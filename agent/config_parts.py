@@ -41,7 +41,7 @@ PROTECTED = UnsafeSettings()
 
 
 class LocalizationPart(Part):
-    kind: Literal["clat", "replica", "jlatt", "leader", "fixed"] = "clat"
+    kind: Literal["clat", "replica", "jlatt", "leader", "relative", "fixed"] = "clat"
     form: Literal["auto", "split_joint", "safe", "published", "joint"] = "auto"
     transform: Literal["unscented", "linearized", "jacobian"] | None = None
     correlation: Literal["factors", "ignored"] = "factors"
@@ -70,8 +70,8 @@ class LocalizationPart(Part):
                 self._refuse(key, "leader", f"kind '{self.kind}' follows nobody")
         elif self.leader is None:
             raise ConfigError("leader is missing: kind = 'leader' needs the id of who leads, as leader = 'r1'")
-        if self.kind == "fixed":
-            self._refuse("innovation_cap", "clat", "kind 'fixed' has no innovations")
+        if self.kind in ("fixed", "relative"):
+            self._refuse("innovation_cap", "clat", f"kind '{self.kind}' has no innovations of poses")
         if self.kind != "clat":
             for key in ("form", "correlation", "pair_interval_s"):
                 self._refuse(key, "clat", f"kind '{self.kind}' has no contacts of pairs")

@@ -158,3 +158,12 @@ class CooperativeFilter(Protocol):
     def saved(self) -> Saved | None:
         """What another filter of the form can begin with; None: nothing."""
         ...
+
+
+@runtime_checkable
+class AnonymousFilter(Protocol):
+    """A filter that also takes measurements of others whose names nobody knows."""
+
+    def anonymous(self, t_ns: int, event: Observation) -> None:
+        """Use a measurement of somebody."""
+        ...

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from agent.cooperative_filter import Completing, CooperativeFilter
+from agent.cooperative_filter import AnonymousFilter, Completing, CooperativeFilter
 from agent.effects import Alarm, Effect, Estimate, Persist, Publish, Send
 from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError
 from agent.events import (
@@ -267,6 +267,8 @@ class Agent:
     def _queue_observation(self, event: Observation) -> None:
         if event.kind not in RELATIVE_ANGLES:
             self.counters["observation.unknown_kind"] += 1
+        elif event.of is None and self.settings.relative.leads and isinstance(self.filter, AnonymousFilter):
+            self._queue(Item(event.t_meas_ns, Phase.PAIR, "", event))
         elif event.of is None:
             self.counters["observation.no_identity"] += 1
         elif event.of.startswith("landmark:"):

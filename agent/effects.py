@@ -45,14 +45,38 @@ class TrackEstimate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class RelativeEstimate:
+    """Where a peer is relative to the own body, as far as it is known by the instant `t_ns`.
+
+    mean (4,)  x, y, z [m] in the own body frame (forward, left, up), and its heading less the own one; cov (4, 4) of it
+    weight     probability of this hypothesis among all that are kept, `tracks` of them
+    ambiguity  probability of the second one that is another place or heading; near `weight`, nobody can tell them apart
+    confirmed  it has been as good as certain for a while
+    """
+
+    peer: str
+    t_ns: int
+    mean: Array
+    cov: Array
+    weight: float
+    ambiguity: float
+    tracks: int
+    confirmed: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """Own belief at `t_ns`: mean (n,), cov (n, n) over a state of `model`; ENU, heading CCW from east."""
+    """Own belief at `t_ns`: mean (n,), cov (n, n) over a state of `model`; ENU, heading CCW from east.
+
+    `relatives`: where others are relative to the own body, of who locates itself so.
+    """
 
     t_ns: int
     model: str
     mean: Array
     cov: Array
     tracks: tuple[TrackEstimate, ...] = ()
+    relatives: tuple[RelativeEstimate, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.effects import Estimate, TrackEstimate
+from agent.effects import Estimate, RelativeEstimate, TrackEstimate
 
 Array = NDArray[np.float64]
 
@@ -64,13 +64,27 @@ class Figures:
 
 
 def known(estimate: Estimate) -> dict[str, object]:
-    """What a robot that has started knows, for its status: place and tracks [m], their deviations, ages [s]."""
+    """What a robot that has started knows, for its status: place and tracks [m], their deviations, ages [s], others."""
     return {
         "state": "running",
         "x_m": float(estimate.mean[0]),
         "y_m": float(estimate.mean[1]),
         "sigma_m": _sigma_m(estimate.cov),
         "tracks": {track.target: _track(track, estimate.t_ns) for track in estimate.tracks},
+        **({"relatives": {item.peer: _relative(item) for item in estimate.relatives}} if estimate.relatives else {}),
+    }
+
+
+def _relative(found: RelativeEstimate) -> dict[str, float | bool]:
+    return {
+        "x_m": float(found.mean[0]),
+        "y_m": float(found.mean[1]),
+        "z_m": float(found.mean[2]),
+        "heading_rad": float(found.mean[3]),
+        "sigma_m": _sigma_m(found.cov),
+        "weight": float(found.weight),
+        "ambiguity": float(found.ambiguity),
+        "confirmed": bool(found.confirmed),
     }
 
 

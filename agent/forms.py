@@ -14,6 +14,7 @@ from agent.health import Health
 from agent.jlatt_filter import JlattFilter
 from agent.joint_filter import JointFilter
 from agent.leader_filter import LeaderFilter
+from agent.relative_filter import RelativeFilter
 from agent.replica_filter import ReplicaFilter
 from agent.saved_state import Saved, SavedFactors, SavedSplit
 from agent.settings import AgentSettings
@@ -52,6 +53,8 @@ def _localizing(
         return FixedFilter(settings, counters, saved if isinstance(saved, SavedSplit) else None)
     if settings.localization.kind == "leader" and settings.source == "survey":
         return LeaderFilter(settings, counters, count_nis, saved if isinstance(saved, SavedSplit) else None)
+    if settings.localization.kind == "relative" and settings.source == "survey":
+        return RelativeFilter(settings, counters, saved if isinstance(saved, SavedSplit) else None)
     if isinstance(saved, SavedFactors):
         kept = JointFilter if settings.localization.form == "joint" else FactorFilter
         return kept(settings, counters, count_nis, saved, health=health)

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from agent.cooperative_filter import Completing, CooperativeFilter
+from agent.cooperative_filter import AnonymousFilter, Completing, CooperativeFilter
 from agent.effects import Effect
 from agent.estimation.observation import absolute_model, relative_model, told
 from agent.events import Completed, Fix, Observation, Received
@@ -51,6 +51,10 @@ class Instant:
         elif item.phase is Phase.TARGET:
             assert event.of is not None
             self.filter.sighting(item.t_ns, event.of.removeprefix("target:"), event)
+        elif event.of is None:
+            # Only a filter that takes them is handed measurements of nobody knows whom.
+            if isinstance(self.filter, AnonymousFilter):
+                self.filter.anonymous(item.t_ns, event)
         else:
             self._contact(item.t_ns, event, effects)
 

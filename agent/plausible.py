@@ -28,6 +28,7 @@ from network.messages import (
     SplitRequest,
     SplitSnapshot,
 )
+from network.relative_messages import HypothesesReport, MotionReport
 
 Array = NDArray[np.float64]
 
@@ -46,6 +47,10 @@ def plausible(body: Body) -> bool:
         return _bearings_possible(body)
     if isinstance(body, LeaderReport):
         return bool(np.abs(body.place).max() <= FARTHEST and body.cov.diagonal().min() >= SUREST)
+    if isinstance(body, MotionReport):
+        return body.height is None or abs(body.height.altitude_m) <= FARTHEST
+    if isinstance(body, HypothesesReport):
+        return _hypotheses_possible(body)
     if not isinstance(body, PairRequest | PairReply | SplitRequest | SplitReply) or body.snapshot is None:
         return True
     return all(_possible(*part) for part in _beliefs(body.snapshot))
@@ -65,6 +70,16 @@ def _bearings_possible(report: BearingReport) -> bool:
     return all(np.abs(found).max() <= FARTHEST for found in numbers) and all(
         found.min() >= SUREST for found in variances
     )
+
+
+def _hypotheses_possible(report: HypothesesReport) -> bool:
+    for item in report.subjects:
+        for means, covs in ((item.means, item.covs), (item.priors, item.prior_covs)):
+            if means is None or covs is None or not len(means):
+                continue
+            if np.abs(means).max() > FARTHEST or covs.diagonal(axis1=1, axis2=2).min() < SUREST:
+                return False
+    return True
 
 
 def _beliefs(told: Snapshot | JointSnapshot | SplitSnapshot) -> Iterator[tuple[str, Array, Array]]:

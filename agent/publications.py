@@ -48,6 +48,18 @@ def estimate_bytes(estimate: Estimate) -> bytes:
             "mean": estimate.mean.tolist(),
             "cov": estimate.cov.tolist(),
             "tracks": {track.target: [track.mean.tolist(), track.cov.tolist()] for track in estimate.tracks},
+            "relatives": {
+                found.peer: {
+                    "t_ns": found.t_ns,
+                    "mean": found.mean.tolist(),
+                    "cov": found.cov.tolist(),
+                    "weight": float(found.weight),
+                    "ambiguity": float(found.ambiguity),
+                    "tracks": int(found.tracks),
+                    "confirmed": bool(found.confirmed),
+                }
+                for found in estimate.relatives
+            },
         }
     )
     return data

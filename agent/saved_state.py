@@ -4,8 +4,9 @@ Who keeps correlation factors (`safe`, `published`, `joint`) goes on with them. 
 the last message of a contact: what peers have been told is in them as lines and bases then, and what was learnt since
 is forgotten by one side only, as if a reply had been lost (`agent.pairing`). The shell writes before it sends.
 
-Who keeps none (`split_joint`, `auto`, kinds `jlatt`, `leader`, `fixed`) begins with its belief, all of which counts as
-shared, correlated with everybody's in an unknown way. That holds however old the bytes are and whatever was said since.
+Who keeps none (`split_joint`, `auto`, the kinds `jlatt`, `leader`, `relative`, `fixed`) begins with its belief, all of
+which counts as shared, correlated with everybody's in an unknown way. That holds however old the bytes are and whatever
+was said since.
 
 Either way the state is of its instant, and the robot coasts from there: it does not know how it moved meanwhile.
 
@@ -145,7 +146,7 @@ def begun_again(settings: AgentSettings) -> AgentSettings:
     whole belief counts as shared. A fix, or a place that a peer tells, is new information, and needs nothing.
     """
     localization = settings.localization
-    alone = settings.source != "survey" or localization.kind in ("replica", "jlatt", "leader", "fixed")
+    alone = settings.source != "survey" or localization.kind in ("replica", "jlatt", "leader", "relative", "fixed")
     if alone or settings.unsafe.trust_restarts:
         return settings
     if localization.form in ("auto", "split_joint"):
@@ -292,7 +293,7 @@ def _decoded(raw: Any, settings: AgentSettings) -> Restored:
     start_ns, t_ns = read_stamp(start), read_stamp(instant)
     if start_ns > t_ns:
         raise StateError("inconsistent")
-    read = _read_split if expected in ("split_joint", "jlatt", "leader", "fixed") else _read_factors
+    read = _read_split if expected in ("split_joint", "jlatt", "leader", "relative", "fixed") else _read_factors
     return Restored(start_ns, read(settings, t_ns, mean, cov, body), read_by_id(verdicts, 5, _read_verdict))
 
 

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.correspondence import CorrespondenceSettings
 from agent.estimation.intersection import Weight
 from agent.estimation.motion import PLANAR_MOTION, RobotMotion, StateLayout, TargetMotion
 from agent.estimation.unscented import DEFAULT, Transform, UnscentedParameters
@@ -34,7 +35,8 @@ def nanoseconds(seconds: float) -> int:
 class LocalizationSettings:
     """Cooperative localization: `clat`, by contacts of pairs; `replica`, by raw data told to the whole team;
     `jlatt`, by rounds in which neighbours tell their beliefs; `leader`, by a leader that tells where it was; `fixed`,
-    not at all: the pose is what fixes say.
+    not at all: the pose is what fixes say; `relative`, as `fixed`, and others are located relative to the own body
+    (`RelativeSettings`).
 
     leader, exchange  who leads, and whether it tells everybody once per round, or who asks
     fixes             of the leader: they are `fused`, or `trusted` as by the kind `fixed`
@@ -48,7 +50,7 @@ class LocalizationSettings:
     max_lines                         identity lines kept per peer
     """
 
-    kind: Literal["clat", "replica", "jlatt", "leader", "fixed"] = "clat"
+    kind: Literal["clat", "replica", "jlatt", "leader", "relative", "fixed"] = "clat"
     form: Literal["auto", "split_joint", "safe", "published", "joint"] = "auto"
     leader: str = ""
     exchange: Literal["broadcast", "request"] = "broadcast"
@@ -260,6 +262,24 @@ class TargetSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class RelativeSettings:
+    """How a robot of the kind `relative` locates others relative to its own body.
+
+    peers              the others; nobody else counts
+    leads              it has a camera that sees others, and finds out where they are; else it only tells how it moves
+    known              the camera knows whom it sees; else it does not, and `correspondence` says how that is found out
+    acceleration_mps2, turn_acceleration_radps2  how the velocity of a peer that is not heard may change (1 sigma)
+    """
+
+    peers: tuple[str, ...] = ()
+    leads: bool = False
+    known: bool = False
+    correspondence: CorrespondenceSettings = field(default_factory=CorrespondenceSettings)
+    acceleration_mps2: float = 1.0
+    turn_acceleration_radps2: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
 class TrackEnd:
     """When a track ends: nothing learnt for `after_ns`, or a position deviation above `above_m`; None: never."""
 
@@ -308,6 +328,7 @@ class AgentSettings:
     unsafe: UnsafeSettings = UnsafeSettings()
     track: bool = True
     tracking: TrackingSettings = TrackingSettings()
+    relative: RelativeSettings = RelativeSettings()
     team: tuple[TeamMember, ...] = ()
     track_end: TrackEnd = TrackEnd()
     track_within_m: float | None = None

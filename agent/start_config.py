@@ -61,7 +61,7 @@ def check_start(
             f"source = '{source}' does not go with {rigid}, which takes all robots to start together; "
             "take form = 'split_joint'"
         )
-    if source == "peer" and localization.kind in ("jlatt", "leader", "fixed"):
+    if source == "peer" and localization.kind in ("jlatt", "leader", "relative", "fixed"):
         raise ConfigError(
             f"source = 'peer' does not go with kind = '{localization.kind}', where nobody asks a single peer; "
             "take 'fix' or 'survey'"

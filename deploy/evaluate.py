@@ -128,7 +128,11 @@ def _sample(
                 for effect in made:
                     if isinstance(effect, Publish):
                         estimate = effect.estimate
-                        rows.published(replace(estimate, t_ns=clock.origin_ns(estimate.t_ns) - t0_ns))
+                        relatives = tuple(
+                            replace(found, t_ns=clock.origin_ns(found.t_ns) - t0_ns) for found in estimate.relatives
+                        )
+                        t_ns = clock.origin_ns(estimate.t_ns) - t0_ns
+                        rows.published(replace(estimate, t_ns=t_ns, relatives=relatives))
             rows.end()
 
 

@@ -115,5 +115,6 @@ class InstantEstimates:
                 self._sampler.put(self._robot, self._robot, self._row, chosen.mean, chosen.cov)
                 for track in chosen.tracks:
                     self._sampler.put(self._robot, track.target, self._row, track.mean, track.cov)
+                self._sampler.put_relatives(self._robot, self._row, chosen.relatives)
             self._row += 1
             self._chosen = self._latest

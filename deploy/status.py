@@ -170,6 +170,7 @@ class LiveTable:
         for name, running in sorted(launcher.members.items()):
             notes += [f"{name}: {reason}" for reason in running.status.get("health", {}).get("reasons", [])]
             notes += [f"{name}: hears {peer} and is not heard by it" for peer in running.status.get("unheard_by", [])]
+            notes += [f"{name}: {told}" for told in identified(running.status)]
             notes += [f"{name}: {reason}" for reason in stillness(running.status, alone=len(launcher.members) <= 2)]
         table = Table(
             title=title,
@@ -188,6 +189,11 @@ class LiveTable:
                 continue
             table.add_row(robot.id, *_cells(member.exit_code, member.status))
         return table
+
+
+def identified(status: dict[str, Any]) -> list[str]:
+    """How many others a robot that locates them has identified, and who is ambiguous; nothing for another one."""
+    return [str(status["form_reason"])] if status.get("relatives") else []
 
 
 def stillness(status: dict[str, Any], *, alone: bool) -> list[str]:
@@ -288,6 +294,14 @@ def print_summary(summary: dict[str, Any], run_dir: Path, report: Path | None) -
         console.print(
             f"targets: position RMSE {_number(fleet['target_position_rmse_m'], 3)} m, "
             f"ANEES {_number(fleet.get('target_anees'), 2)}"
+        )
+    relative = summary.get("relative")
+    if relative is not None:
+        console.print(
+            f"relative: {_number(100.0 * relative['identified_share'][-1][1], 0)} % identified at the end, half "
+            f"after {_number(relative['time_to_identify_s']['median'], 1)} s; position RMSE "
+            f"{_number(relative['position_rmse_m'], 2)} m (median {_number(relative['position_error_median_m'], 2)}), "
+            f"ANEES {_number(relative['anees_median'], 2)}"
         )
     network = summary["network"]
     pair = network["pair"]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from network.leader_messages import LeaderReport, LeaderRequest
+from network.relative_messages import HypothesesReport, MotionReport
 
 Array = NDArray[np.float64]
 
@@ -427,6 +428,8 @@ Body = (
     | BearingReport
     | LeaderRequest
     | LeaderReport
+    | MotionReport
+    | HypothesesReport
 )
 
 

@@ -41,6 +41,7 @@ from network.messages import (
     StartRequest,
     TeamReport,
 )
+from network.relative_messages import HypothesesReport, MotionReport
 from network.wire_bearings import pack_bearings, read_bearings
 from network.wire_fields import (
     WireError,
@@ -55,6 +56,7 @@ from network.wire_fields import (
     read_text,
 )
 from network.wire_leader import pack_request, pack_word, read_request, read_word
+from network.wire_relative import pack_hypotheses, pack_motion, read_hypotheses, read_motion
 from network.wire_round import pack_round, read_round
 from network.wire_snapshots import (
     pack_joint,
@@ -68,7 +70,7 @@ from network.wire_team import pack_report, read_report
 
 _HELLO, _PAIR_REQUEST, _PAIR_REPLY, _SPLIT_REQUEST, _SPLIT_REPLY, _TEAM_REPORT = 1, 2, 3, 4, 5, 6
 _JOINT_REQUEST, _JOINT_REPLY, _START_REQUEST, _LIFE_NOTICE, _ROUND_REPORT = 7, 8, 9, 10, 11
-_BEARING_REPORT = 12
+_BEARING_REPORT, _MOTION_REPORT, _HYPOTHESES_REPORT = 12, 13, 14
 _LEADER_REQUEST, _LEADER_REPORT = 15, 16
 _HEADER_BYTES = 3 + 25 + 5 * 9 + 1
 """Upper bound of what surrounds a body: array marks, schema, longest source, five integers, kind."""
@@ -158,6 +160,10 @@ def _pack_body(body: Body) -> tuple[int, tuple[Any, ...]]:
         return _LEADER_REQUEST, pack_request(body)
     if isinstance(body, LeaderReport):
         return _LEADER_REPORT, pack_word(body)
+    if isinstance(body, MotionReport):
+        return _MOTION_REPORT, pack_motion(body)
+    if isinstance(body, HypothesesReport):
+        return _HYPOTHESES_REPORT, pack_hypotheses(body)
     if isinstance(body, StartRequest):
         return _START_REQUEST, (pack_epoch(body.epoch),)
     if isinstance(body, LifeNotice):
@@ -321,4 +327,6 @@ _BODIES: dict[int, Callable[[Any, Header], Body]] = {
     _BEARING_REPORT: read_bearings,
     _LEADER_REQUEST: read_request,
     _LEADER_REPORT: read_word,
+    _MOTION_REPORT: read_motion,
+    _HYPOTHESES_REPORT: read_hypotheses,
 }

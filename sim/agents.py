@@ -49,6 +49,7 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
         "motion": table(robot.motion()),
         "localization": table(scenario.localization_of(robot)),
         "tracking": table(scenario.tracking_of(robot)),
+        "correspondence": correspondence_table(scenario, robot),
         "lateness": table(scenario.lateness_of(robot)),
         "coast": table(scenario.coast),
         "health": table(scenario.health),
@@ -75,6 +76,14 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
         "zenoh": {"listen": [], "peers": []},
         "state_dir": "state",
     }
+
+
+def correspondence_table(scenario: Scenario, robot: RobotPart) -> dict[str, Any]:
+    """How a robot tells the others apart, and who they are."""
+    found = table(scenario.correspondence_of(robot))
+    if scenario.localization_of(robot).kind == "relative":
+        found["peers"] = [other.id for other in scenario.robots if other.id != robot.id]
+    return found
 
 
 def team_tables(scenario: Scenario, world: World, robot: RobotPart) -> list[dict[str, Any]]:

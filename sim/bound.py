@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.centralized import CentralizedFilter
-from agent.estimation.observation import OutOfViewError
+from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError
 from agent.events import LEVEL, Odometry
 from agent.sensor_input import SensorConfig
 from agent.settings import CoastSettings, nanoseconds
@@ -116,6 +116,9 @@ class _Joint:
     def use(self, item: Output, sensors: dict[tuple[str, str], SensorConfig]) -> None:
         """A measurement, not earlier than the one before."""
         if item.of is not None and item.phase is Phase.PAIR and self._thinned(item, item.of):
+            return
+        if item.of is None and item.kind in RELATIVE_ANGLES:
+            # Of whom it is nobody knows, in one place either.
             return
         self._advance(item.robot, item.t_ns)
         if item.of is None:

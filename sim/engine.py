@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.effects import RelativeEstimate
 from agent.fault_parts import AnyFaultPart
 from agent.node import Node, Outgoing, Recorder
 from agent.sensor_input import encode
@@ -357,9 +358,17 @@ class VirtualEngine:
             self._sampler.put(robot, robot, row, estimate.mean, estimate.cov)
             for track in estimate.tracks:
                 self._sampler.put(robot, track.target, row, track.mean, track.cov)
+            self._sampler.put_relatives(robot, row, self._since_start(process, estimate.relatives))
         if self._bound is not None:
             for entity in (*self._world.robots, *self._world.targets):
                 self._sampler.put_bound(entity, row, self._bound.belief(entity))
+
+    def _since_start(
+        self, process: Process, relatives: tuple[RelativeEstimate, ...]
+    ) -> tuple[RelativeEstimate, ...]:
+        """The same with instants of the true clock."""
+        origin_ns = process.clock.origin_ns
+        return tuple(replace(found, t_ns=origin_ns(found.t_ns)) for found in relatives)
 
     def result(self) -> TrialResult:
         """Figures of what has been played."""

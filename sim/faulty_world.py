@@ -113,7 +113,11 @@ class FaultyWorld:
             z = item.z.copy()
             z[0] += fault.bias
             return replace(item, z=_possible(item.kind, z))
-        draw = generator(self.seed, name, item.robot, item.sensor, item.of or "", str(item.t_ns))
+        of = item.of or ""
+        if item.of is None and item.kind in RELATIVE_ANGLES:
+            # Several of one instant have no name: what is measured tells them apart.
+            of = item.z.tobytes().hex()
+        draw = generator(self.seed, name, item.robot, item.sensor, of, str(item.t_ns))
         if isinstance(fault, SensorDelayPart):
             tail_ns = exponential_ns(nanoseconds(fault.tail_s), draw.random())
             return replace(item, late_ns=item.late_ns + nanoseconds(fault.delay_s) + tail_ns)

@@ -134,6 +134,7 @@ def _covariances(estimate: Estimate) -> Iterable[tuple[str, str]]:
     for name, mean, cov in (
         ("the own belief", estimate.mean, estimate.cov),
         *((f"the track of {track.target}", track.mean, track.cov) for track in estimate.tracks),
+        *((f"the place of {other.peer}", other.mean, other.cov) for other in estimate.relatives),
     ):
         if not np.isfinite(mean).all():
             yield "covariance", f"the mean of {name} is not finite"
@@ -147,10 +148,10 @@ def _unlearnt(life: _Life, estimate: Estimate) -> Iterable[tuple[str, str]]:
     """Where nothing has been learnt the determinant of the pose covariance (x, y, heading) does not fall.
 
     That of the position alone may: what was unsure across the track can become what is unsure along it. A `replica`
-    makes its belief anew from all data, whenever any arrive, and who is `fixed` believes what it is told.
+    makes its belief anew from all data, whenever any arrive, and who is `fixed` or `relative` believes what it is told.
     """
     agent = life.node.agent
-    if agent.settings.localization.kind in ("replica", "fixed"):
+    if agent.settings.localization.kind in ("replica", "fixed", "relative"):
         return
     learnt = sum(entry.count for entry in agent.nis.values())
     learnt += sum(count for name, count in agent.counters.items() if name.startswith(LEARNING))

@@ -8,13 +8,14 @@ estimate (NaN) is left out.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian import is_positive_definite, quadratic_form, wrap
+from sim.relative_figures import Pair, RelativeTrace, combine_relatives, reduce_relatives, trial_row
 
 Array = NDArray[np.float64]
 Window = tuple[float, float]
@@ -43,13 +44,15 @@ class StateTrace:
 class TrialTrace:
     """Samples of one trial. `targets` is by target, then by the robot that tracks it.
 
-    `bound`, if given, is {"robots": {id: StateTrace}, "targets": {id: StateTrace}}.
+    `bound`, if given, is {"robots": {id: StateTrace}, "targets": {id: StateTrace}}. `relatives`: what a robot made of
+    another one, by both.
     """
 
     t_s: Array
     robots: dict[str, StateTrace]
     targets: dict[str, dict[str, StateTrace]]
     bound: dict[str, dict[str, StateTrace]] | None = None
+    relatives: dict[Pair, RelativeTrace] = field(default_factory=dict)
 
 
 def components(trace: StateTrace) -> list[str]:
@@ -181,6 +184,9 @@ def reduce_trial(
         "targets": {target: states(owners) for target, owners in trace.targets.items()},
         "bound": None if trace.bound is None else {group: states(items) for group, items in trace.bound.items()},
     }
+    relative = reduce_relatives(trace.t_s, trace.relatives, inside)
+    if relative is not None:
+        reduced["relative"] = relative
     for target, owners in trace.targets.items() if measured is not None else ():
         seen = {robot: times for (robot, of), times in (measured or {}).items() if of == f"target:{target}"}
         for robot, track in owners.items():
@@ -308,6 +314,8 @@ def trial_figures(reduced: dict[str, Any]) -> dict[str, Any]:
         row[f"{name}_position_rmse_m"] = _rmse(list(owners.values()))
         if any(item["velocity"] is not None for item in owners.values()):
             row[f"{name}_velocity_rmse_mps"] = _rmse(list(owners.values()), "velocity")
+    if "relative" in reduced:
+        row |= trial_row(reduced["relative"])
     return row
 
 
@@ -352,6 +360,8 @@ def combine(trials: Sequence[dict[str, Any]], lost_above_m: float) -> dict[str, 
             "robots": {name: _entity([bound["robots"][name] for bound in kept], True) for name in first["robots"]},
             "targets": {name: _entity([bound["targets"][name] for bound in kept], False) for name in first["targets"]},
         }
+    if "relative" in first:
+        summary["relative"] = combine_relatives([trial["relative"] for trial in trials])
     summary["series"] = _series(used)
     return summary
 

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from sim import availability, error_plots, plots, series_plots, tables
+from sim import availability, error_plots, plots, relative_plots, series_plots, tables
 from sim.animation import player
 from sim.page import cards, number, page, picture, section, size, verdict
 from sim.plots import ReportUnavailable
+from sim.relative_figures import RIGHT_M
 from sim.store import Stored
 
 Pictures = dict[str, tuple[str, str, Path]]
@@ -44,6 +45,11 @@ def _pictures(folder: Path, summary: dict[str, Any], stored: Stored | None) -> P
     if stored is not None:
         _of_one_trial(stored, (summary["window_s"][0], summary["window_s"][1]), add)
         _of_motion(stored, summary.get("motion", {}), add)
+        _of_relatives(stored, add)
+    if "relative" in summary:
+        share = summary["relative"]["identified_share"]
+        text = f"Share of robots whose believed place is within {RIGHT_M:g} m of the true one."
+        add("identified", "Who is identified", text, lambda path: relative_plots.shares(share, path))
     return found
 
 
@@ -124,6 +130,26 @@ def _of_motion(stored: Stored, motion: dict[str, Any], add: Add) -> None:
         "How far robots were from each other",
         f"True distances of all pairs on the ground; below {limit_m:g} m it is a collision.",
         lambda path: series_plots.pair_distances(stored.trace.t_s, places, limit_m, path),
+    )
+
+
+def _of_relatives(stored: Stored, add: Add) -> None:
+    traces, t_s = stored.trace.relatives, stored.trace.t_s
+    if not traces:
+        return
+    add(
+        "frames",
+        "Where leaders take the others to be",
+        "Seen from above in the body frame of each leader, which looks to the right: true ways, and the hypothesis "
+        "that is believed.",
+        lambda path: relative_plots.frames(traces, path),
+    )
+    add(
+        "hypotheses",
+        "Hypotheses and their errors",
+        "How many hypotheses there are of each robot, how far off the believed one is, and the probability of the "
+        "second one that is elsewhere.",
+        lambda path: relative_plots.over_time(t_s, traces, path),
     )
 
 

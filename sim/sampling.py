@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.effects import RelativeEstimate
 from agent.estimation.motion import LAYOUTS
 from agent.settings import NS, nanoseconds
 from sim.metrics import StateTrace, TrialTrace
+from sim.relative_figures import Pair, RelativeTrace, blank, fill, relative_state
 from sim.scenario import Scenario
 from sim.world import Output, World
 
@@ -49,6 +51,7 @@ class Sampler:
         for robot in world.robots:
             for entity in (robot, *world.targets):
                 self._owned[robot, entity] = self._blank(entity)
+        self._relatives: dict[Pair, RelativeTrace] = {}
         self._bound = {name: self._blank(name) for name in (*world.robots, *world.targets)} if with_bound else None
 
     def _blank(self, entity: str) -> tuple[Array, Array]:
@@ -67,6 +70,17 @@ class Sampler:
     def put(self, robot: str, entity: str, row: int, mean: Array, cov: Array) -> None:
         means, covs = self._owned[robot, entity]
         means[row], covs[row] = mean, cov
+
+    def put_relatives(self, robot: str, row: int, relatives: tuple[RelativeEstimate, ...]) -> None:
+        """Where a robot takes others to be; their instants are since the start."""
+        for found in relatives:
+            if (robot, found.peer) not in self._relatives:
+                self._relatives[robot, found.peer] = blank(len(self._instants))
+            trace = self._relatives[robot, found.peer]
+            k = round(found.t_ns / self._world.step_ns)
+            fill(trace, row, found, (self._instants[row] * self._world.step_ns - found.t_ns) / NS)
+            if 0 <= k <= self._world.steps:
+                trace.truth[row] = relative_state(self._world.truth(robot, k), self._world.truth(found.peer, k))
 
     def put_bound(self, entity: str, row: int, belief: tuple[Array, Array] | None) -> None:
         """None: there is no belief (yet)."""
@@ -100,4 +114,5 @@ class Sampler:
                 for target in self._world.targets
             },
             bound=bound,
+            relatives=dict(sorted(self._relatives.items())),
         )

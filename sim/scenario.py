@@ -42,11 +42,13 @@ from agent.estimation.mounting import mount_of
 from agent.fault_parts import FaultPart
 from agent.motion_parts import ControlNoisePart, ControlPart, OdometryPart
 from agent.planning_parts import PLAIN, PlanningPart, RoundPart
+from agent.relative_parts import CorrespondencePart
 from agent.sensor_input import SensorConfig
 from agent.settings import nanoseconds
 from agent.start_config import StartSource
 from agent.target_parts import TargetModel, TrackingPart, target_motion
 from agent.unsafe_parts import UnsafePart
+from sim.arcs import ArcPart
 from sim.course import CoursePart, DrivePart
 from sim.directions import DirectionNoise
 
@@ -60,15 +62,17 @@ MIN_STEP_S = 0.001
 
 
 class PlacementPart(Part):
-    """Where robots start: each on its circle at a phase drawn from the seed.
+    """Where robots start.
 
-    A draw is rejected until the contact graph over one lap (who comes within `contact_range_m` of whom on
-    undisturbed circles) connects every robot with `reaches`.
+    `random_phases`: each on its circle at a phase drawn from the seed. A draw is rejected until the contact graph over
+    one lap (who comes within `contact_range_m` of whom on undisturbed circles) connects every robot with `reaches`.
+    `apart`: poses with a `spread` are drawn until no two robots are nearer than `apart_m`, seen from above.
     """
 
-    rule: Literal["random_phases"] = "random_phases"
-    contact_range_m: Positive
-    reaches: Id
+    rule: Literal["random_phases", "apart"] = "random_phases"
+    contact_range_m: Positive | None = None
+    reaches: Id | None = None
+    apart_m: Positive | None = None
     max_draws: Annotated[int, Field(ge=1)] = 10000
 
 
@@ -121,7 +125,8 @@ class SensorPart(Part):
     `max_range_m`, nearer than `min_range_m` or out of the field of view `fov_rad`, which is centred on the sensor's
     forward axis. Simulated ranges are too long by `bias_m`, or by what `bias_of` says of the subject. Directions
     (`bearing3`) err by `noise`, see `sim.directions`. Who could be seen is detected with the probability `detects`; the
-    share `false_share` of detections is of a direction drawn evenly. With a `gimbal` the field of view is a cone about
+    share `false_share` of detections is of a direction drawn evenly. A camera that is `anonymous` does not tell whom it
+    sees, and sees `clutter` others per scan where nobody is. With a `gimbal` the field of view is a cone about
     where the camera saw a target last, see `sim.gimbal`. A recorded camera has the mount and intrinsics of the
     recording. The error of absolute information lasts for `correlation_s` (first-order; 0: each is a new one).
     """
@@ -137,6 +142,8 @@ class SensorPart(Part):
     detects: Share = 1.0
     false_share: Share = 0.0
     correlation_s: NotNegative = 0.0
+    anonymous: bool = False
+    clutter: NotNegative = 0.0
     bias_m: Finite = 0.0
     bias_of: dict[str, Finite] = {}
     max_range_m: Positive | None = None
@@ -194,7 +201,7 @@ class RobotPart(Part):
 
     With a `course` it follows that exactly, at its commanded speed, and the noise is what its odometry is off by.
     `start_source` is where it has its start from, see `agent.start_config`; `tilt_rad` is the standard deviation of its
-    roll and pitch, new at every instant and known to it.
+    roll and pitch, new at every instant and known to it. With an `arc` it flies that exactly, and its odometry errs.
     """
 
     id: Id
@@ -206,6 +213,7 @@ class RobotPart(Part):
     course: DrivePart | None = None
     control: ControlPart = ControlPart()
     noise: ControlNoisePart = ControlNoisePart()
+    arc: ArcPart | None = None
     odometry: OdometryPart | None = None
     vehicle: VehiclePart = VehiclePart()
     tilt_rad: NotNegative = 0.0
@@ -213,6 +221,7 @@ class RobotPart(Part):
     autopilot: AutopilotPart = AutopilotPart()
     localization: dict[str, Any] = {}
     tracking: dict[str, Any] = {}
+    correspondence: dict[str, Any] = {}
     lateness: dict[str, Any] = {}
     planning: dict[str, Any] = {}
 
@@ -295,6 +304,7 @@ class Scenario(Part):
     world: WorldPart = WorldPart()
     localization: LocalizationPart = LocalizationPart()
     tracking: TrackingPart = TrackingPart()
+    correspondence: CorrespondencePart = CorrespondencePart()
     lateness: LatenessPart = LatenessPart()
     coast: CoastPart = CoastPart()
     health: HealthPart = HealthPart()
@@ -325,6 +335,9 @@ class Scenario(Part):
 
     def tracking_of(self, robot: RobotPart) -> TrackingPart:
         return self._overridden(TrackingPart, self.tracking, robot, "tracking")
+
+    def correspondence_of(self, robot: RobotPart) -> CorrespondencePart:
+        return self._overridden(CorrespondencePart, self.correspondence, robot, "correspondence")
 
     def planning_of(self, robot: RobotPart) -> PlanningPart:
         return self._overridden(PlanningPart, self.planning, robot, "planning")

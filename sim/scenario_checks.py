@@ -14,6 +14,7 @@ from agent.joint_room import check_room
 from agent.leader_parts import check_lateness
 from agent.motion_parts import ControlPart
 from agent.start_config import check_start
+from sim.relative_checks import check_relative
 from sim.scenario import (
     KINDS,
     MIN_STEP_S,
@@ -58,7 +59,15 @@ def check(scenario: Scenario) -> None:
         raise ConfigError(f"{scenario.name}: world.path is missing; add --set world.path=FOLDER of the recording")
     placement = scenario.world.placement
     circling = [robot.id for robot in scenario.robots if robot.start.circle is not None]
-    if placement is not None and circling and placement.reaches not in circling:
+    if placement is not None and placement.rule == "apart":
+        if placement.apart_m is None:
+            raise ConfigError(f"{scenario.name}: world.placement.apart_m is missing: rule = 'apart' needs it")
+    elif placement is not None and (placement.contact_range_m is None or placement.reaches is None):
+        key = "contact_range_m" if placement.contact_range_m is None else "reaches"
+        raise ConfigError(f"{scenario.name}: world.placement.{key} is missing: rule = 'random_phases' needs it")
+    elif placement is not None and placement.apart_m is not None:
+        raise ConfigError(f"{scenario.name}: world.placement.apart_m is of rule = 'apart'; take that, or leave it out")
+    elif placement is not None and circling and placement.reaches not in circling:
         raise ConfigError(
             f"{scenario.name}: world.placement.reaches = '{placement.reaches}' is no robot on a circle; "
             f"there are: {', '.join(circling)}"
@@ -70,6 +79,7 @@ def check(scenario: Scenario) -> None:
     _check_steering(scenario)
     _check_planning(scenario)
     _check_team(scenario)
+    check_relative(scenario)
     check_schedule(scenario, scenario.faults)
     for robot in scenario.robots:
         _check_mover(f"{scenario.name}: robots.{robot.id}", robot)
@@ -190,6 +200,7 @@ def _check_team(scenario: Scenario) -> None:
 UNMIXED = {
     "replica": "who does not tell its raw data is nowhere in the belief of the others",
     "jlatt": "who takes no part in rounds is not heard by those who do",
+    "relative": "who does not tell how it moves is nowhere for the others",
 }
 """Kinds that all robots of a fleet have, or none, and why."""
 
@@ -293,7 +304,7 @@ def _check_course(where: str, target: TargetPart) -> None:
 
 def _check_recorded(where: str, sensor: SensorPart) -> None:
     """What a recorded sensor said is not made worse."""
-    for key in ("noise", "detects", "false_share", "gimbal"):
+    for key in ("noise", "detects", "false_share", "gimbal", "anonymous", "clutter"):
         if getattr(sensor, key) != getattr(SensorPart(), key):
             raise ConfigError(f"{where}.{key} does not go with a recording, which is as it is; leave it out")
 
@@ -344,6 +355,8 @@ def check_sensor(where: str, name: str, sensor: SensorPart) -> None:
         ("noise", ("bearing3",)),
         ("detects", tuple(RELATIVE_ANGLES)),
         ("false_share", ("bearing", "bearing3")),
+        ("anonymous", ("bearing3",)),
+        ("clutter", ("bearing3",)),
     ):
         if getattr(sensor, key) != getattr(SensorPart(), key) and kind not in kinds:
             raise ConfigError(f"{where}.{key} is of kind {' and '.join(kinds)}, not of '{kind}'; leave it out")

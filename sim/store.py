@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.metrics import StateTrace, TrialTrace
+from sim.relative_figures import RelativeTrace
 from sim.sight import View
 
 FILE = "trace.npz"
@@ -62,8 +63,12 @@ def save_trace(
             add(f"bound.{group}", [name], state)
     for place, times in enumerate((measured or {}).values()):
         arrays[f"measured.{place}"] = np.diff(np.round(times * 1e6).astype(np.int64), prepend=0)
+    parts = [item.name for item in fields(RelativeTrace)]
+    for place, relative in enumerate(trace.relatives.values()):
+        arrays |= {f"relative.{place}.{name}": getattr(relative, name) for name in parts}
     meta = {
         "index": index,
+        "relatives": list(trace.relatives),
         "contacts": contacts,
         "landmarks": {name: place[:2] for name, place in landmarks.items()},
         "bound": trace.bound is not None,
@@ -98,7 +103,14 @@ def load_trace(run_dir: Path) -> Stored | None:
                 targets.setdefault(names[0], {})[names[1]] = state
             else:
                 bound[entry["group"].removeprefix("bound.")][names[0]] = state
-        trace = TrialTrace(t_s=data["t_s"], robots=robots, targets=targets, bound=bound if meta["bound"] else None)
+        relatives = {
+            (str(robot), str(peer)): RelativeTrace(
+                **{item.name: data[f"relative.{place}.{item.name}"] for item in fields(RelativeTrace)}
+            )
+            for place, (robot, peer) in enumerate(meta.get("relatives", []))
+        }
+        best = bound if meta["bound"] else None
+        trace = TrialTrace(t_s=data["t_s"], robots=robots, targets=targets, bound=best, relatives=relatives)
         measured = {
             (str(robot), str(of)): np.cumsum(data[f"measured.{place}"]) * 1e-6
             for place, (robot, of) in enumerate(meta.get("measured", []))

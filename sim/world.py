@@ -17,13 +17,15 @@ from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, OutOfVi
 from agent.estimation.odometry import OdometryNoise
 from agent.settings import NS, nanoseconds
 from agent.timeline import Phase
+from sim.arcs import flown
 from sim.closed_loop import ClosedLoop, Motion, planar_of
+from sim.clutter import Clutter
 from sim.course import driven_along
 from sim.directions import DRAWS, anywhere, direction_covariance, direction_of, disturbed, vector
 from sim.gimbal import Gimbal, level_turned
 from sim.motion import driven
 from sim.noise import generator, normal_rows, uniform_rows
-from sim.placement import draw_phases
+from sim.placement import draw_phases, draw_spread, spread_pose
 from sim.scenario import RobotPart, Scenario, SensorPart, TargetPart, sensor_kind
 from sim.sight import places, sights, steps_between
 from sim.steering import steered
@@ -158,7 +160,12 @@ class SimulatedWorld:
         self._commands: dict[str, Array] = {}
         for target in scenario.targets:
             self._tracks[target.id] = driven(scenario, target, start_pose(target, phases, seed), seed, self.steps)
-        starts = {robot.id: start_pose(robot, phases, seed) for robot in scenario.robots}
+        spread = draw_spread(scenario, seed)
+        starts = {
+            robot.id: spread[robot.id] if robot.id in spread else start_pose(robot, phases, seed)
+            for robot in scenario.robots
+        }
+        self._flown: dict[str, Array] = {}
         if scenario.world.steering is not None:
             around = self._tracks[scenario.targets[0].id]
             tracks, commands = steered(scenario, scenario.world.steering, starts, around, seed, self.steps)
@@ -166,7 +173,12 @@ class SimulatedWorld:
             self._commands |= commands
         else:
             for robot in scenario.robots:
-                self._tracks[robot.id] = driven(scenario, robot, starts[robot.id], seed, self.steps)
+                if robot.arc is None:
+                    self._tracks[robot.id] = driven(scenario, robot, starts[robot.id], seed, self.steps)
+                    continue
+                self._tracks[robot.id], self._flown[robot.id] = flown(
+                    robot.arc, starts[robot.id], scenario.step_s, self.steps, seed, robot.id
+                )
         self.motion = Motion()
         for robot in scenario.planners():
             states = self.motion.states[robot.id] = self._tracks[robot.id]
@@ -195,6 +207,12 @@ class SimulatedWorld:
         }
         self._sensor_noise: dict[tuple[str, str, str], Array] = {}
         self._chances: dict[tuple[str, str, str], Array] = {}
+        self._clutter = {
+            (robot.id, name): Clutter(sensor.clutter, seed, self.steps + 1, robot.id, name)
+            for robot in scenario.robots
+            for name, sensor in robot.sensors.items()
+            if sensor.clutter > 0.0
+        }
         self._gimbals = {
             (robot.id, name): Gimbal(sensor.fov_rad or 2.0 * np.pi, self._heading(robot.id, 0))
             for robot in scenario.robots
@@ -258,9 +276,13 @@ class SimulatedWorld:
             delta += off * self._noise(robot.id, "odometry", "", k, 4)
         if LAYOUTS[robot.model] is UNICYCLE_GAINS:
             delta[[0, 1, 3]] = reported(self._tracks[robot.id][k - 1], delta[[0, 1, 3]])
+        if robot.id in self._flown:
+            delta = self._flown[robot.id][k - 1].copy()
         delta = noise.calibrated(delta)
         t_ns = k * self.step_ns
         cov = noise.covariance(delta, dt)
+        if robot.id in self._flown:
+            delta += np.sqrt(np.diagonal(cov)) * self._noise(robot.id, "odometry", "", k, 4)
         return Output(t_ns, Phase.PREDICT, robot.id, "odometry", "odometry", None, delta, cov, t_ns - self.step_ns)
 
     def _noise(self, robot: str, sensor: str, of: str, k: int, size: int) -> Array:
@@ -347,7 +369,16 @@ class SimulatedWorld:
             wrap_components(z, model.angles)
             if kind in ("range", "range_bearing"):
                 z[0] = max(z[0] + sensor.bias_of.get(of, sensor.bias_m), 0.0)
-            outputs.append(Output(t_ns, phase_of(of), robot.id, name, kind, of, z, R, attitude=attitude))
+            told = None if sensor.anonymous else of
+            outputs.append(Output(t_ns, phase_of(of), robot.id, name, kind, told, z, R, attitude=attitude))
+        if (robot.id, name) in self._clutter:
+            for z in self._clutter[robot.id, name].at(k, sensor.fov_rad):
+                R = direction_covariance(sensor.noise, z, sensor.sigma_rad or 0.0)
+                R = R if sensor.noise in DRAWS else relative_noise(kind, sensor, 0.0)
+                outputs.append(Output(t_ns, Phase.PAIR, robot.id, name, kind, None, z, R, attitude=attitude))
+        if sensor.anonymous:
+            # Nothing of the order in which robots are listed may tell who they are.
+            outputs.sort(key=lambda item: float(item.z[0]))
         return outputs
 
     def _heading(self, robot: str, k: int) -> float:
@@ -380,10 +411,7 @@ def start_pose(robot: RobotPart | TargetPart, phases: dict[str, float], seed: in
     """True start of a robot; on a circle it heads along the tangent, counter-clockwise, at its commanded altitude."""
     if robot.start.circle is None:
         assert robot.start.pose is not None
-        pose, spread = np.array(robot.start.pose), np.array(robot.start.spread)
-        if len(spread):
-            pose[: len(spread)] += spread * generator(seed, robot.id, "place").uniform(-1.0, 1.0, len(spread))
-        return pose
+        return spread_pose(robot, seed, ("place",))
     phase, circle = phases[robot.id], robot.start.circle
     x = circle.center_m[0] + circle.radius_m * np.cos(phase)
     y = circle.center_m[1] + circle.radius_m * np.sin(phase)

@@ -9,8 +9,8 @@ import msgpack
 import numpy as np
 import pytest
 
-from agent.effects import Alarm, Estimate, TrackEstimate
-from agent.publications import ALARM_INTERVAL_S, PUBLISH_INTERVAL_S, Publications
+from agent.effects import Alarm, Estimate, RelativeEstimate, TrackEstimate
+from agent.publications import ALARM_INTERVAL_S, PUBLISH_INTERVAL_S, Publications, estimate_bytes
 
 ESTIMATE = Estimate(
     5,
@@ -61,3 +61,17 @@ def test_an_equal_alarm_is_logged_once_per_window(
         "peer.silent: r3",
         "peer.silent: r2",
     ]
+
+
+def test_where_others_are_is_told_with_how_sure_it_is() -> None:
+    found = RelativeEstimate("p1", 9, np.arange(4.0), np.eye(4), np.float64(0.75), 0.25, 2, np.bool_(True))
+    told = msgpack.unpackb(estimate_bytes(Estimate(10, "spatial", np.zeros(4), np.eye(4), (), (found,))))
+    assert told["relatives"]["p1"] == {
+        "t_ns": 9,
+        "mean": [0.0, 1.0, 2.0, 3.0],
+        "cov": np.eye(4).tolist(),
+        "weight": 0.75,
+        "ambiguity": 0.25,
+        "tracks": 2,
+        "confirmed": True,
+    }

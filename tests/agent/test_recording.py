@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from agent.config import AgentConfig
 from agent.config_file import validate
 from agent.core import Agent
-from agent.effects import Alarm, Broadcast, Effect, Estimate, Publish, Send, Steer, TrackEstimate
+from agent.effects import Alarm, Broadcast, Effect, Estimate, Publish, RelativeEstimate, Send, Steer, TrackEstimate
 from agent.events import (
     ControlReport,
     Event,
@@ -51,7 +51,7 @@ from network.messages import (
     Snapshot,
     TargetBelief,
 )
-from tests.network.test_wire import example_round
+from tests.network.test_wire import example_hypotheses, example_motion, example_round
 
 S = 1_000_000_000
 
@@ -180,7 +180,7 @@ def test_a_truncated_file_is_refused_but_can_be_read_to_its_end(tmp_path: Path, 
         assert (part, read_agents(path, unfinished=True)) == ([], {})
 
 
-@pytest.mark.parametrize("share", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize("share", [0.2, 0.45, 0.8])
 def test_a_damaged_file_is_refused(recorded: Path, share: float) -> None:
     """A flipped bit is found by the checksums of the file, not mistaken for another behaviour."""
     data = bytearray(recorded.read_bytes())
@@ -287,6 +287,7 @@ SNAPSHOT = Snapshot(
 RANGE = Measurement("range", np.array([4.2]), np.eye(1), (0.1, 0.2, 0.0, 0.0, 0.0, 0.3))
 REQUEST = PairRequest(Epoch(9, "r2", 3), (RANGE,), SNAPSHOT)
 HEADER = Header("r2", 2**60, 3, 17, 5, 6)
+SEEN = RelativeEstimate("p1", 4, np.arange(4.0), np.eye(4), 0.75, 0.25, 2, True)
 VALUES: list[Any] = [
     Tick(2**62),
     Odometry(3, 1, 2, np.array([1.0, np.pi, 0.0, 1e-300]), np.eye(4)),
@@ -299,6 +300,9 @@ VALUES: list[Any] = [
     Send("r2", 5, PairReply(Epoch(9, "r2", 3), ReplyStatus.OK, SNAPSHOT)),
     Broadcast(Channel.BELIEF, 5, Hello("v")),
     Publish(Estimate(5, "unicycle", np.zeros(3), np.eye(3), (TrackEstimate("t1", "unicycle", np.ones(3), np.eye(3)),))),
+    Publish(Estimate(5, "spatial", np.zeros(4), np.eye(4), (), (SEEN,))),
+    Received(3, Message(HEADER, example_motion())),
+    Received(3, Message(HEADER, example_hypotheses())),
     Alarm("lost", "r2"),
     Received(3, Message(HEADER, example_round())),
     Steer((0.5, 0.0, -0.0), 0.25, 7),

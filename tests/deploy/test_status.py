@@ -14,7 +14,7 @@ from agent.autopilot_settings import AutopilotSettings
 from agent.health import Health
 from agent.settings import NS, HealthSettings
 from agent.steering_link import SteeringSettings
-from deploy.status import LiveTable, _cells, stillness
+from deploy.status import LiveTable, _cells, identified, stillness
 from sim.scenario_file import load
 
 
@@ -69,3 +69,9 @@ def test_it_is_said_why_a_robot_that_is_to_move_does_not() -> None:
 def test_rounds_are_counted_and_those_left_out() -> None:
     status = {"x_m": 0.0, "y_m": 0.0, "sigma_m": 0.1, "lag_s": 0.0, "counters": {"round.closed": 7, "round.skipped": 2}}
     assert _cells(None, status)[5] == "7 (2 skipped)"
+
+
+def test_how_many_others_are_identified_is_said_of_who_locates_them() -> None:
+    status = {"x_m": 0.0, "form_reason": "3 of 4 identified; p2 ambiguous (0.48)", "relatives": {"p1": {}}}
+    assert identified(status) == ["3 of 4 identified; p2 ambiguous (0.48)"]
+    assert identified({"x_m": 0.0, "form_reason": "no camera: it tells how it moves"}) == []

@@ -27,7 +27,7 @@ CORE_SECONDS = 60.0
 LIES_MOVE = 10.0
 """How far an authentic liar may move any number of an estimate [m, m^2, ...]; it was 1.7 at most."""
 
-JUDGING = ("safe", "joint", "split_joint", "jlatt", "icf_plus")
+JUDGING = ("safe", "joint", "split_joint", "jlatt", "icf_plus", "relative")
 """Forms that judge what peers tell."""
 
 RSS_SLACK_MB = 24.0

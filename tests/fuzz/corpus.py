@@ -41,18 +41,29 @@ FORMS = {
         "targets.t1.control={}",
         "targets.t1.noise={acceleration_mps2=0.1}",
     ],
+    "relative": [],
 }
-"""`--set` overrides by form."""
+"""`--set` overrides by form; `relative` is a fleet of its own, for it needs robots in space."""
 
-KINDS = frozenset((*range(1, 10), 11, 12, 15, 16))
+KINDS = frozenset((*range(1, 10), *range(11, 17)))
 """Every kind of message of the wire format but the notice to a robot that is there twice."""
 
 
 def fleet(form: str, duration_s: float, clock_sigma_s: float = 0.005) -> Scenario:
     """Five robots in reach of each other and of a target, no faults, messages that take a while."""
+    if form == "relative":
+        return _leaders(duration_s, clock_sigma_s)
     more = [f"lateness.clock_sigma_s={clock_sigma_s}", *FORMS[form]]
     more += [f"duration_s={duration_s}", f"window_s=[2, {duration_s}]", "links.delay_s=0.05"]
     return load("fault-plan", more).model_copy(update={"fault_plan": None})
+
+
+def _leaders(duration_s: float, clock_sigma_s: float) -> Scenario:
+    """Five robots r1 to r5 that locate each other relative to their bodies; r1 and r2 have cameras."""
+    more = [f"lateness.clock_sigma_s={clock_sigma_s}", f"duration_s={duration_s}", f"window_s=[2, {duration_s}]"]
+    made = load("correspondence", [*more, "links.delay_s=0.05"])
+    robots = [robot.model_copy(update={"id": f"r{index}"}) for index, robot in enumerate(made.robots, 1)]
+    return made.model_copy(update={"robots": robots})
 
 
 class Listener:

@@ -329,6 +329,8 @@ class CoreFlood:
         for target, tracks in trace.targets.items():
             for name, track in tracks.items():
                 found[f"{target} of {name} mean"], found[f"{target} of {name} cov"] = track.mean, track.cov
+        for (name, peer), seen in trace.relatives.items():
+            found[f"{peer} by {name} mean"], found[f"{peer} by {name} cov"] = seen.mean, seen.cov
         return found
 
     def reasons(self) -> Counter[str]:

@@ -21,7 +21,7 @@ def test_mutated_messages_are_refused_for_a_reason_or_valid() -> None:
     assert len(flood.delivered) >= 5, "bodies of most kinds are let through now and then"
 
 
-@pytest.mark.parametrize("form", ["safe", "split_joint", "jlatt", "icf_plus"])
+@pytest.mark.parametrize("form", ["safe", "split_joint", "jlatt", "icf_plus", "relative"])
 def test_a_flood_that_is_refused_changes_no_estimate_by_a_bit(form: str) -> None:
     still = CoreFlood(form, None, 1, SECONDS)
     still.play()

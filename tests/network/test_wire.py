@@ -56,6 +56,7 @@ from network.messages import (
     TargetBelief,
     TeamReport,
 )
+from network.relative_messages import Height, HypothesesReport, MotionReport, SubjectReport
 from network.wire import OversizeError, decode, encode, peek_header, size_bound
 from network.wire_fields import MAX_INT, MEASUREMENT_DIMS, MODEL_DIMS, REASONS, WireError
 from network.wire_team import ABSOLUTE_DIMS, MAX_INDEX
@@ -173,6 +174,20 @@ def example_word() -> LeaderReport:
     return LeaderReport(np.array([1.5, -2.0]), np.diag([0.25, 0.5]), np.array([1.0, 0.5]), HEADER.t_meas_ns - 100)
 
 
+def example_motion() -> MotionReport:
+    """A robot that flies a turn, with its altitude of a moment ago."""
+    velocity = np.array([0.5, -0.25, 0.125, 0.0625])
+    return MotionReport(50_000_000, velocity, np.diag([0.5, 0.5, 0.5, 0.125]), Height(488.1, 0.25, 1_000))
+
+
+def example_hypotheses() -> HypothesesReport:
+    """Two places where one robot may be, with what was known before of the first, and one of another."""
+    means = np.array([[1.0, -2.0, 0.5, 3.0], [1.0, 2.0, 0.5, -3.0]])
+    covs = np.array([np.diag([0.5, 0.25, 0.125, 1.0]) + 0.0625, np.eye(4)])
+    first = SubjectReport("p1", np.array([0.75, 0.125]), means, covs, -means, 2.0 * covs, (True, False))
+    return HypothesesReport(900, 1, 2, (first, SubjectReport("p2", np.ones(1), means[:1], covs[:1])))
+
+
 EXAMPLES: dict[str, Body] = {
     "hello": Hello("0.1.0", (ClockEcho("r2", 10, 20), ClockEcho("r3", 30, 40))),
     "pair_request": example_request(),
@@ -190,6 +205,8 @@ EXAMPLES: dict[str, Body] = {
     "leader_request": LeaderRequest(9),
     "leader_report": example_word(),
     "leader_answer": dataclasses.replace(example_word(), before_ns=None, answers=9),
+    "motion_report": example_motion(),
+    "hypotheses_report": example_hypotheses(),
     "life_notice": LifeNotice(2**53 - 1, 9, True),
 }
 
