@@ -40,6 +40,8 @@ DISTINCT = 13.28
 LEAST_CLUTTER = 0.1
 """False bearings per scan that are expected even of a sensor that is said to have none."""
 
+DOUBT = 0.1
+
 STRANGENESS = 1.0
 """Density of wrong hypotheses that another leader may tell [1/(m^3 rad)]."""
 
@@ -350,5 +352,6 @@ def _rules(settings: CorrespondenceSettings) -> Rules:
         floor=1e-5 if improved else 1e-4,
         depth=20 if improved else 10,
         family=1e-3 if improved else 1e-2,
+        doubt=DOUBT if improved else 0.0,
         layers=2 if _fusion(settings) == "subtraction" else 1,
     )

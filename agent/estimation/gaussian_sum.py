@@ -61,6 +61,10 @@ PUBLISHED_BIRTH = np.array([0.1, 0.1, 0.05, 4.0 * math.pi])
 SERIOUS = 3e-3
 """Only tracks of more weight make a bearing that of their robot rather than another's."""
 
+FADING = 0.95
+DEBT = 30.0
+WORST = 30.0
+
 HEAVY = 1e-3
 """Only tracks of more weight keep a bearing in their gate from beginning a new one."""
 
@@ -74,6 +78,7 @@ class Rules:
     strangeness, adoption    of told hypotheses: density of those of no track [1/(m^3 rad)], weight of a new track
     improved                 exact moments, second order and fans; else linearized, with the modified gate
     floor, depth, family     least weight of a track; scans after which families are judged; their least weight
+    doubt                    least weight of what is not refuted, all other modes together
     most                     tracks of one robot
     layers                   2 if a track also keeps what it was at the last fusion, else 1
     """
@@ -89,6 +94,7 @@ class Rules:
     floor: float
     depth: int
     family: float
+    doubt: float = 0.0
     most: int = 30
     layers: int = 1
 
@@ -107,6 +113,7 @@ class Tracks:
     mean (h, L, 4), cov (h, L, 4, 4)   layer 0 is the belief; layer 1 that of the last fusion, moved to the present
     known (h,)             whether layer 1 tells anything; not of tracks begun since
     lineage (h, N)         names of its ancestors in the last N scans, itself last; 0 before its beginning
+    misfit (h,)            how much worse than a right one it has fitted of late [nat]
     """
 
     of: Rows
@@ -115,6 +122,7 @@ class Tracks:
     cov: Array
     known: Mask
     lineage: Rows
+    misfit: Array
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -127,6 +135,7 @@ class Tracks:
             self.cov[which],
             self.known[which],
             self.lineage[which],
+            self.misfit[which],
         )
 
 
@@ -159,6 +168,7 @@ def no_tracks(rules: Rules) -> Tracks:
         np.empty((0, rules.layers, 4, 4)),
         np.empty(0, dtype=np.bool_),
         np.empty((0, rules.depth), dtype=np.int64),
+        np.empty(0),
     )
 
 
@@ -170,6 +180,7 @@ def joined(*parts: Tracks) -> Tracks:
         np.concatenate([part.cov for part in parts]),
         np.concatenate([part.known for part in parts]),
         np.concatenate([part.lineage for part in parts]),
+        np.concatenate([part.misfit for part in parts]),
     )
 
 
@@ -210,6 +221,7 @@ def scanned(tracks: Tracks, seen: Seen, rules: Rules, name: int) -> tuple[Tracks
     tracks = tracks.rows(seen.present[tracks.of])
     count = len(tracks)
     if count:
+        tracks = replace(tracks, misfit=FADING * tracks.misfit)
         measured = height(tracks.mean[:, 0], tracks.cov[:, 0], seen.heights[tracks.of], seen.height_vars[tracks.of])
         tracks = numbered(tracks, measured, seen.with_height[tracks.of], rules)
         measured = distance(
@@ -239,14 +251,18 @@ def scanned(tracks: Tracks, seen: Seen, rules: Rules, name: int) -> tuple[Tracks
     row, column = row[kept], column[kept]
     mean, cov = tracks.mean[row], tracks.cov[row]
     mean[:, 0], cov[:, 0] = turned_to(mean[:, 0], cov[:, 0], there.H[row], there.S[row], residual[row, column])
+    missed, hit = surprise(rules)
+    misfit = tracks.misfit[row] + hit + 0.5 * d2[row, column] - 1.0
     parts = [
         rest,
-        replace(tracks, weight=still).rows(still >= rules.floor),
-        replace(tracks.rows(row), weight=taken[kept], mean=mean, cov=cov),
+        replace(tracks, weight=still, misfit=tracks.misfit + missed).rows(still >= rules.floor),
+        replace(tracks.rows(row), weight=taken[kept], mean=mean, cov=cov, misfit=misfit),
     ]
     kept = begun >= rules.floor * (FAN if rules.improved else 1)
     if kept.any():
-        parts.append(begun_tracks(which[kept], begun[kept], from_bearing[kept], seen, rules))
+        new = begun_tracks(which[kept], begun[kept], from_bearing[kept], seen, rules)
+        late = np.bincount(tracks.of, minlength=len(seen.present))[new.of] > 0
+        parts.append(replace(new, misfit=np.where(late, DEBT, 0.0)))
     return _renamed(joined(*parts), name)
 
 
@@ -262,7 +278,15 @@ def numbered(tracks: Tracks, measured: Scalar, used: Mask, rules: Rules) -> Trac
     mean, cov = tracks.mean.copy(), tracks.cov.copy()
     mean[:, 0] = np.where(inside[:, None], new_mean, mean[:, 0])
     cov[:, 0] = np.where(inside[:, None, None], new_cov, cov[:, 0])
-    return replace(tracks, weight=weight, mean=mean, cov=cov)
+    misfit = tracks.misfit + np.where(used, 0.5 * np.minimum(d2, WORST) - 0.5, 0.0)
+    return replace(tracks, weight=weight, mean=mean, cov=cov, misfit=misfit)
+
+
+def surprise(rules: Rules) -> tuple[float, float]:
+    """How surprising it is that a robot is not seen, and that it is, less what is expected [nat]."""
+    missed, seen = -math.log(rules.missed), -math.log(1.0 - rules.missed)
+    expected = rules.missed * missed + (1.0 - rules.missed) * seen
+    return missed - expected, seen - expected
 
 
 def _left_over(tracks: Tracks, likely: Array, seen: Seen, rules: Rules) -> Array:
@@ -327,6 +351,7 @@ def begun_tracks(of: Rows, weight: Array, bearing: Rows, seen: Seen, rules: Rule
         np.broadcast_to(cov[:, None], (*layers, 4, 4)).copy(),
         np.zeros(len(of), dtype=np.bool_),
         np.zeros((len(of), rules.depth), dtype=np.int64),
+        np.zeros(len(of)),
     )
 
 

@@ -130,7 +130,7 @@ def _adopted(told: Told, of: int, rules: Rules, name: int) -> Tracks:
     lineage = np.zeros((count, rules.depth), dtype=np.int64)
     lineage[:, -1] = np.arange(name, name + count)
     return Tracks(
-        np.full(count, of), told.weight, told.mean.copy(), told.cov.copy(), np.zeros(count, dtype=np.bool_), lineage
+        np.full(count, of), told.weight, told.mean.copy(), told.cov.copy(), np.zeros(count, dtype=np.bool_), lineage, np.full(count, 0.0)
     )
 
 
