@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation import nearest_track
-from agent.estimation.gaussian import quadratic_form, wrap
 from agent.estimation.gaussian_sum import Rules, Seen, Tracks, joined, moved, no_tracks, scanned
+from agent.estimation.gaussian_sum_doubt import distinct
 from agent.estimation.gaussian_sum_fusion import TOLD, Fusion, Told, fused, seen_back, seen_through
 from agent.estimation.gaussian_sum_pruning import pruned
 from agent.estimation.relative_motion import stepped
@@ -34,13 +34,11 @@ OUTWEIGHED = 2.0
 CONFIRMED, CONFIRMED_RAD, CONFIRMED_S = 0.95, 0.3, 2.0
 """A robot is confirmed whose hypothesis has weighed so much, with a heading of this deviation, for so long."""
 
-DISTINCT = 13.28
-"""Mahalanobis square from which on two hypotheses are two modes: 99 % of four degrees of freedom."""
-
 LEAST_CLUTTER = 0.1
 """False bearings per scan that are expected even of a sensor that is said to have none."""
 
-DOUBT = 0.1
+DOUBT = 0.2
+"""Share of the weight that all modes but the heaviest keep while they are not refuted."""
 
 STRANGENESS = 1.0
 """Density of wrong hypotheses that another leader may tell [1/(m^3 rad)]."""
@@ -225,14 +223,11 @@ class Correspondence:
             return None
         first = int(np.argmax(tracks.lineage[:, -1] == self._believed[index]))
         mean, cov = tracks.mean[:, 0], tracks.cov[:, 0]
-        apart = mean - mean[first]
-        apart[:, 3] = wrap(apart[:, 3])
-        distinct = quadratic_form(apart, cov + cov[first]) > DISTINCT
         return Dominant(
             mean[first],
             cov[first],
             float(tracks.weight[first]),
-            float(np.max(tracks.weight, where=distinct, initial=0.0)),
+            float(np.max(tracks.weight, where=distinct(mean, cov, mean[first], cov[first]), initial=0.0)),
             len(tracks),
             bool(self._sure_s[index] >= CONFIRMED_S),
         )

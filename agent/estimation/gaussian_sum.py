@@ -62,8 +62,13 @@ SERIOUS = 3e-3
 """Only tracks of more weight make a bearing that of their robot rather than another's."""
 
 FADING = 0.95
-DEBT = 30.0
-WORST = 30.0
+"""What a scan leaves of misfits: it is two seconds of ten scans each that count."""
+
+UNPROVEN = 30.0
+"""Misfit of a track that begins where its robot has others [nat]."""
+
+OUTLIER = 30.0
+"""Mahalanobis square of a number beyond which it counts no more against a track."""
 
 HEAVY = 1e-3
 """Only tracks of more weight keep a bearing in their gate from beginning a new one."""
@@ -78,7 +83,7 @@ class Rules:
     strangeness, adoption    of told hypotheses: density of those of no track [1/(m^3 rad)], weight of a new track
     improved                 exact moments, second order and fans; else linearized, with the modified gate
     floor, depth, family     least weight of a track; scans after which families are judged; their least weight
-    doubt                    least weight of what is not refuted, all other modes together
+    doubt                    weight that modes beside the heaviest keep until they are refuted
     most                     tracks of one robot
     layers                   2 if a track also keeps what it was at the last fusion, else 1
     """
@@ -113,7 +118,7 @@ class Tracks:
     mean (h, L, 4), cov (h, L, 4, 4)   layer 0 is the belief; layer 1 that of the last fusion, moved to the present
     known (h,)             whether layer 1 tells anything; not of tracks begun since
     lineage (h, N)         names of its ancestors in the last N scans, itself last; 0 before its beginning
-    misfit (h,)            how much worse than a right one it has fitted of late [nat]
+    misfit (h,)            how much worse than a right one it has fitted of late [nat]; its weight is not in it
     """
 
     of: Rows
@@ -262,7 +267,7 @@ def scanned(tracks: Tracks, seen: Seen, rules: Rules, name: int) -> tuple[Tracks
     if kept.any():
         new = begun_tracks(which[kept], begun[kept], from_bearing[kept], seen, rules)
         late = np.bincount(tracks.of, minlength=len(seen.present))[new.of] > 0
-        parts.append(replace(new, misfit=np.where(late, DEBT, 0.0)))
+        parts.append(replace(new, misfit=np.where(late, UNPROVEN, 0.0)))
     return _renamed(joined(*parts), name)
 
 
@@ -278,7 +283,7 @@ def numbered(tracks: Tracks, measured: Scalar, used: Mask, rules: Rules) -> Trac
     mean, cov = tracks.mean.copy(), tracks.cov.copy()
     mean[:, 0] = np.where(inside[:, None], new_mean, mean[:, 0])
     cov[:, 0] = np.where(inside[:, None, None], new_cov, cov[:, 0])
-    misfit = tracks.misfit + np.where(used, 0.5 * np.minimum(d2, WORST) - 0.5, 0.0)
+    misfit = tracks.misfit + np.where(used, 0.5 * np.minimum(d2, OUTLIER) - 0.5, 0.0)
     return replace(tracks, weight=weight, mean=mean, cov=cov, misfit=misfit)
 
 

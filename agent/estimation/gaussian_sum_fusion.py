@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from agent.estimation import relative_motion
 from agent.estimation.gaussian import wrap
-from agent.estimation.gaussian_sum import HEAVY, Rules, Tracks, gate_limit, joined, normalized
+from agent.estimation.gaussian_sum import HEAVY, UNPROVEN, Rules, Tracks, gate_limit, joined, normalized
 from agent.estimation.gaussian_sum_pruning import pruned
 
 Array = NDArray[np.float64]
@@ -70,7 +70,7 @@ def fused(tracks: Tracks, told: Told, of: int, rules: Rules, by: Fusion, name: i
     if not len(told.weight):
         return tracks
     if not len(tracks):
-        return pruned(_adopted(told, of, rules, name), rules, families=False)
+        return pruned(_adopted(told, of, rules, name, 0.0), rules, families=False)
     mean, cov = tracks.mean[:, 0], tracks.cov[:, 0]
     apart = told.mean[:, 0] - mean[:, None]
     apart[..., 3] = wrap(apart[..., 3])
@@ -99,7 +99,7 @@ def fused(tracks: Tracks, told: Told, of: int, rules: Rules, by: Fusion, name: i
         children = replace(children, weight=found[row, column], mean=mean, cov=cov)
     adopted = np.flatnonzero(strange)
     fresh = Told(new[adopted], told.mean[adopted], told.cov[adopted], told.known[adopted])
-    parts = joined(replace(tracks, weight=alone), children, _adopted(fresh, of, rules, name))
+    parts = joined(replace(tracks, weight=alone), children, _adopted(fresh, of, rules, name, UNPROVEN))
     return pruned(replace(parts, weight=normalized(parts.of, parts.weight)), rules, families=False)
 
 
@@ -125,12 +125,18 @@ def subtracted(mean: Array, cov: Array, told: Told) -> tuple[Array, Array]:
     return _shifted(mean, shift), np.where(sound[:, None, None], _symmetric(new), cov)
 
 
-def _adopted(told: Told, of: int, rules: Rules, name: int) -> Tracks:
+def _adopted(told: Told, of: int, rules: Rules, name: int, misfit: float) -> Tracks:
     count = len(told.weight)
     lineage = np.zeros((count, rules.depth), dtype=np.int64)
     lineage[:, -1] = np.arange(name, name + count)
     return Tracks(
-        np.full(count, of), told.weight, told.mean.copy(), told.cov.copy(), np.zeros(count, dtype=np.bool_), lineage, np.full(count, 0.0)
+        np.full(count, of),
+        told.weight,
+        told.mean.copy(),
+        told.cov.copy(),
+        np.zeros(count, dtype=np.bool_),
+        lineage,
+        np.full(count, misfit),
     )
 
 

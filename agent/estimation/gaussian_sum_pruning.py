@@ -8,13 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian import quadratic_form, wrap
+from agent.estimation.gaussian import wrap
 from agent.estimation.gaussian_sum import Rules, Tracks, normalized
+from agent.estimation.gaussian_sum_doubt import doubted
 
 Array = NDArray[np.float64]
-
-DISTINCT = 13.28
-LIMIT = 12.0
 
 SAME = 1.0
 """Mahalanobis square up to which a track says the same as a heavier one."""
@@ -27,30 +25,13 @@ def pruned(tracks: Tracks, rules: Rules, families: bool) -> Tracks:
     """The tracks worth keeping, heaviest first. families: a scan has passed, so old families are judged."""
     tracks = tracks.rows(tracks.weight >= rules.floor)
     tracks = merged(tracks)
-    if rules.doubt and len(tracks):
+    if rules.doubt > 0.0:
         tracks = doubted(tracks, rules.doubt)
     if families:
         tracks = _without_poor_families(tracks, rules.family)
     if len(tracks) > rules.most:
         tracks = _heaviest(tracks, rules.most)
     return replace(tracks, weight=normalized(tracks.of, tracks.weight)) if len(tracks) else tracks
-
-
-def doubted(tracks: Tracks, doubt: float) -> Tracks:
-    """Tracks, heaviest first, with weights that leave all that is not refuted its doubt."""
-    tracks = replace(tracks, weight=normalized(tracks.of, tracks.weight))
-    first = np.unique(tracks.of, return_index=True)[1]
-    heads = np.zeros(int(tracks.of.max()) + 1, dtype=np.int64)
-    heads[tracks.of[first]] = first
-    head = heads[tracks.of]
-    apart = tracks.mean[:, 0] - tracks.mean[head, 0]
-    apart[:, 3] = wrap(apart[:, 3])
-    other = quadratic_form(apart, tracks.cov[:, 0] + tracks.cov[head, 0]) > DISTINCT
-    other &= tracks.misfit < LIMIT
-    sums = np.bincount(tracks.of, tracks.weight * other)[tracks.of]
-    low = (sums > 0.0) & (sums < doubt)
-    factor = np.where(other, doubt / np.where(low, sums, 1.0), (1.0 - doubt) / np.where(low, 1.0 - sums, 1.0))
-    return replace(tracks, weight=tracks.weight * np.where(low, factor, 1.0))
 
 
 def merged(tracks: Tracks) -> Tracks:
@@ -78,7 +59,7 @@ def merged(tracks: Tracks) -> Tracks:
 
 def _united(tracks: Tracks, root: NDArray[np.int64]) -> Tracks:
     """Moments of groups: root (h,) is the index of the heaviest of each track's group. What is known of the past is of
-    those that have one."""
+    those that have one; names and misfit are the heaviest's."""
     heads = np.flatnonzero(root == np.arange(len(root)))
     member = root == heads[:, None]
     mass = member * tracks.weight

@@ -1,0 +1,59 @@
+"""Weights that claim no more than scans can know: what has not been refuted keeps a share.
+
+Two hypotheses that both fit as a right one would, as of robots that mirror each other, differ by noise alone: by which
+of them the measured velocities happen to suit, and by who is not seen. The log ratio of their weights is then a random
+walk of some 2 nat per scan, and the weight of one drifts to 1 though nothing was learnt. Weighing pairs of robots
+jointly would leave what is due to velocities; evidence that fades, a power less than 1 of each weight, would bound the
+walk, but only far beyond 20 : 1.
+
+So weights alone refute nothing. Each track keeps a misfit, what it has fitted worse than a right one would,
+
+    c <- a c + sum over its measurements of (d^2 - dof) / 2, and of how much rarer than expected its being seen is
+
+which for a right track is about zero, whatever the others' are, with a deviation of some 4 nat for the memory of
+1 / (1 - a) scans, and which grows for a wrong one until the track is refuted. Modes other than the heaviest that are
+not refuted keep a share of the weight, all of them together. A track begun beside others has yet to prove itself: it
+begins refuted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.estimation.gaussian import quadratic_form, wrap
+from agent.estimation.gaussian_sum import Tracks, normalized
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+DISTINCT = 13.28
+"""Mahalanobis square from which on two hypotheses are two modes: 99 % of four degrees of freedom."""
+
+REFUTED = 20.0
+"""Misfit from which on a track is refuted [nat]: about five deviations of a right one's."""
+
+
+def distinct(mean: Array, cov: Array, other_mean: Array, other_cov: Array) -> Mask:
+    """Whether beliefs (..., 4), (..., 4, 4) are another mode than others."""
+    apart = mean - other_mean
+    apart[..., 3] = wrap(apart[..., 3])
+    return np.asarray(quadratic_form(apart, cov + other_cov) > DISTINCT)
+
+
+def doubted(tracks: Tracks, doubt: float) -> Tracks:
+    """Tracks, heaviest first, with weights that leave a share `doubt` to modes that are not refuted, if there are any,
+    in proportion to what they have."""
+    if not len(tracks):
+        return tracks
+    weight = normalized(tracks.of, tracks.weight)
+    robots, first = np.unique(tracks.of, return_index=True)
+    head = first[np.searchsorted(robots, tracks.of)]
+    mean, cov = tracks.mean[:, 0], tracks.cov[:, 0]
+    other = (tracks.misfit < REFUTED) & distinct(mean, cov, mean[head], cov[head])
+    share = np.bincount(tracks.of, weight * other)[tracks.of]
+    short = (share > 0.0) & (share < doubt)
+    raised = np.where(other, doubt / np.where(short, share, 1.0), (1.0 - doubt) / np.where(short, 1.0 - share, 1.0))
+    return replace(tracks, weight=np.where(short, weight * raised, weight))
