@@ -44,8 +44,8 @@ def distinct(mean: Array, cov: Array, other_mean: Array, other_cov: Array) -> Ma
 
 
 def doubted(tracks: Tracks, doubt: float) -> Tracks:
-    """Tracks, heaviest first, with weights that leave a share `doubt` to modes that are not refuted, if there are any,
-    in proportion to what they have."""
+    """Tracks, heaviest first. Modes that are not refuted, if there are any, weigh together at least as a share `doubt`
+    of themselves and the heaviest track, in proportion to what they have."""
     if not len(tracks):
         return tracks
     weight = normalized(tracks.of, tracks.weight)
@@ -53,7 +53,11 @@ def doubted(tracks: Tracks, doubt: float) -> Tracks:
     head = first[np.searchsorted(robots, tracks.of)]
     mean, cov = tracks.mean[:, 0], tracks.cov[:, 0]
     other = (tracks.misfit < REFUTED) & distinct(mean, cov, mean[head], cov[head])
-    share = np.bincount(tracks.of, weight * other)[tracks.of]
-    short = (share > 0.0) & (share < doubt)
-    raised = np.where(other, doubt / np.where(short, share, 1.0), (1.0 - doubt) / np.where(short, 1.0 - share, 1.0))
-    return replace(tracks, weight=np.where(short, weight * raised, weight))
+    theirs = np.bincount(tracks.of, weight * other)[tracks.of]
+    due = doubt / (1.0 - doubt) * weight[head]
+    raised = other & (theirs < due)
+    if not raised.any():
+        return replace(tracks, weight=weight)
+    weight = normalized(tracks.of, weight * np.where(raised, due / np.where(raised, theirs, 1.0), 1.0))
+    order = np.argsort(-weight, kind="stable")
+    return replace(tracks, weight=weight).rows(order)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
 from agent.estimation.gaussian import wrap
-from agent.estimation.gaussian_sum import FAN, Rules, Seen, Tracks, begun_tracks, no_tracks, scanned
+from agent.estimation.gaussian_sum import FADING, FAN, Rules, Seen, Tracks, begun_tracks, no_tracks, scanned
+from agent.estimation.gaussian_sum_doubt import REFUTED
 from agent.estimation.gaussian_sum_pruning import pruned
 from tests.assertions import assert_covariance
 
@@ -44,6 +45,7 @@ def tracks_of(*of: int, mean: Array, weight: Array, sigma: float = 0.3, heading:
         np.broadcast_to(cov, (count, 1, 4, 4)).copy(),
         np.zeros(count, dtype=np.bool_),
         np.arange(1, 4 * count + 1).reshape(count, 4),
+        np.zeros(count),
     )
 
 
@@ -199,6 +201,36 @@ def test_a_bearing_outside_all_gates_begins_a_fan_of_headings_where_the_range_sa
     off = wrap(angles[:, None] - found.mean[:, 0, 3])
     mixed = norm(0.0, np.sqrt(found.cov[0, 0, 3, 3])).pdf(off).mean(axis=1)
     assert np.ptp(mixed) < 0.05 * mixed.mean()
+
+
+def test_what_a_track_fits_worse_than_a_right_one_would_is_its_misfit() -> None:
+    """Half of each Mahalanobis square less half its degrees of freedom, and how rare it is not to be seen."""
+    start = replace(tracks_of(0, mean=[[4.0, 1.0, 0.5, 0.3]], weight=[1.0]), misfit=np.array([7.0]))
+    bearing = np.array([[0.3, 0.15]])
+    found, _ = scanned(start, seen_of([0.7], [np.nan], bearing), IMPROVED, 10)
+    z = start.cov[0, 0, 2, 2]
+    height = 0.2**2 / (z + H_VAR)
+    m, P, _ = ekf(start.mean[0, 0], start.cov[0, 0], 0.2, np.array([0.0, 0.0, 1.0, 0.0]), np.array([[H_VAR]]))
+    x, y, z = m[:3]
+    q, d2 = np.hypot(x, y), m[:3] @ m[:3]
+    H = np.array([[-y / q**2, x / q**2, 0.0, 0.0], [-x * z / (q * d2), -y * z / (q * d2), q / d2, 0.0]])
+    off = bearing[0] - [np.arctan2(y, x), np.arctan2(z, q)]
+    seen = float(off @ np.linalg.solve(H @ P @ H.T + NOISE, off))
+    rare = 1.0 - IMPROVED.detection * IMPROVED.gate
+    usual = -rare * np.log(rare) - (1.0 - rare) * np.log(1.0 - rare)
+    before = FADING * 7.0 + 0.5 * (height - 1.0)
+    expected = [before - np.log(rare) - usual, before + 0.5 * (seen - 2.0) - np.log(1.0 - rare) - usual]
+    assert found.misfit == pytest.approx(expected)
+
+
+def test_a_track_begun_beside_others_has_yet_to_prove_itself() -> None:
+    """Else any bearing of somebody else would leave no robot sure."""
+    seen = seen_of([0.4], [5.0], np.array([[2.0, 0.1]]))
+    first, _ = scanned(no_tracks(IMPROVED), seen, IMPROVED, 1)
+    assert np.all(first.misfit < REFUTED)
+    beside, _ = scanned(tracks_of(0, mean=[[-4.0, 1.0, 0.4, 0.3]], weight=[1.0]), seen, IMPROVED, 1)
+    new = beside.lineage[:, -2] == 0
+    assert new.sum() == FAN and np.all(beside.misfit[new] > REFUTED)
 
 
 def test_published_tracks_begin_with_the_printed_mean_variance_and_weight() -> None:
