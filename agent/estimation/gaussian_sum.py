@@ -64,7 +64,7 @@ SERIOUS = 3e-3
 FADING = 0.95
 """What a scan leaves of misfits: it is two seconds of ten scans each that count."""
 
-UNPROVEN = 30.0
+UNPROVEN = 45.0
 """Misfit of a track that begins where its robot has others [nat]."""
 
 OUTLIER = 30.0
@@ -252,6 +252,9 @@ def scanned(tracks: Tracks, seen: Seen, rules: Rules, name: int) -> tuple[Tracks
     of = np.concatenate([tracks.of, tracks.of[row], which])
     weight = normalized(of, np.concatenate([unseen, found[row, column], fresh]))
     still, taken, begun = np.split(weight, [count, count + len(row)])
+    if rules.doubt > 0.0:
+        # Not to be seen once is far more evidence than who may be in whose place can know.
+        still = np.where(tracks.weight > HEAVY, np.maximum(still, rules.floor), still)
     kept = taken >= rules.floor
     row, column = row[kept], column[kept]
     mean, cov = tracks.mean[row], tracks.cov[row]
