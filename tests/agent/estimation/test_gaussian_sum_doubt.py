@@ -64,8 +64,8 @@ def test_doubt_makes_nothing_heavier_than_the_heaviest() -> None:
 def test_modes_are_distinct_beyond_their_common_deviation_and_across_the_half_turn() -> None:
     mean, cov = np.array([0.0, 0.0, 0.0, 3.1]), np.eye(4)
     assert not distinct(mean, cov, np.array([0.0, 0.0, 0.0, -3.1]), cov)
-    assert not distinct(mean, cov, mean + [5.1, 0.0, 0.0, 0.0], cov)
-    assert distinct(mean, cov, mean + [5.2, 0.0, 0.0, 0.0], cov)
+    assert not distinct(mean, cov, mean + np.array([5.1, 0.0, 0.0, 0.0]), cov)
+    assert distinct(mean, cov, mean + np.array([5.2, 0.0, 0.0, 0.0]), cov)
 
 
 def test_pruning_leaves_doubt_where_the_rules_have_any() -> None:
