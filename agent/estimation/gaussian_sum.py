@@ -64,10 +64,10 @@ SERIOUS = 3e-3
 FADING = 0.95
 """What a scan leaves of misfits: it is two seconds of ten scans each that count."""
 
-UNPROVEN = 30.0
+UNPROVEN = 35.0
 """Misfit of a track that begins where its robot has others [nat]."""
 
-OUTLIER = 30.0
+OUTLIER = 15.0
 """Mahalanobis square of a number beyond which it counts no more against a track."""
 
 HEAVY = 1e-3

@@ -3,14 +3,14 @@
 Two hypotheses that both fit as a right one would, as of robots that mirror each other, differ by noise alone: by which
 of them the measured velocities happen to suit, and by who is not seen. The log ratio of their weights is then a random
 walk of some 2 nat per scan, and the weight of one drifts to 1 though nothing was learnt. Weighing pairs of robots
-jointly would leave what is due to velocities; evidence that fades, a power less than 1 of each weight, would bound the
-walk, but only far beyond 20 : 1.
+jointly would leave what is due to velocities; evidence that fades, a power of 0.9 of each weight, bounds the walk too
+late: measured, one of a mirrored pair was still claimed to be certain three times in four.
 
 So weights alone refute nothing. Each track keeps a misfit, what it has fitted worse than a right one would,
 
     c <- a c + sum over its measurements of (d^2 - dof) / 2, and of how much rarer than expected its being seen is
 
-which for a right track is about zero, whatever the others' are, with a deviation of some 4 nat for the memory of
+which for a right track is about zero, whatever the others' are, with a deviation of some 5 nat for the memory of
 1 / (1 - a) scans, and which grows for a wrong one until the track is refuted. Modes other than the heaviest that are
 not refuted keep a share of the weight, all of them together. A track begun beside others has yet to prove itself: it
 begins refuted.
@@ -32,8 +32,8 @@ Mask = NDArray[np.bool_]
 DISTINCT = 13.28
 """Mahalanobis square from which on two hypotheses are two modes: 99 % of four degrees of freedom."""
 
-REFUTED = 20.0
-"""Misfit from which on a track is refuted [nat]: about five deviations of a right one's."""
+REFUTED = 25.0
+"""Misfit from which on a track is refuted [nat]: five deviations of a right one's."""
 
 
 def distinct(mean: Array, cov: Array, other_mean: Array, other_cov: Array) -> Mask:

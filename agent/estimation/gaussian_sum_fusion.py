@@ -87,6 +87,9 @@ def fused(tracks: Tracks, told: Told, of: int, rules: Rules, by: Fusion, name: i
     alone = weight * rules.missed * rules.strangeness
     new = np.where(strange, other * rules.adoption, 0.0)
     total = found.sum() + alone.sum() + new.sum()
+    if rules.doubt > 0.0:
+        # That another leader does not tell of it refutes no track of weight.
+        alone = np.where(tracks.weight > HEAVY, np.maximum(alone, 2.0 * rules.floor * total), alone)
     row, column = np.nonzero(found >= rules.floor * total)
     children = tracks.rows(row)
     if len(row):
