@@ -64,7 +64,7 @@ SERIOUS = 3e-3
 FADING = 0.95
 """What a scan leaves of misfits: it is two seconds of ten scans each that count."""
 
-UNPROVEN = 35.0
+UNPROVEN = 47.0
 """Misfit of a track that begins where its robot has others [nat]."""
 
 OUTLIER = 15.0

@@ -32,8 +32,8 @@ Mask = NDArray[np.bool_]
 DISTINCT = 13.28
 """Mahalanobis square from which on two hypotheses are two modes: 99 % of four degrees of freedom."""
 
-REFUTED = 25.0
-"""Misfit from which on a track is refuted [nat]: five deviations of a right one's."""
+REFUTED = 35.0
+"""Misfit from which on a track is refuted [nat]: seven deviations of a right one's, whose distribution has a tail."""
 
 
 def distinct(mean: Array, cov: Array, other_mean: Array, other_cov: Array) -> Mask:
