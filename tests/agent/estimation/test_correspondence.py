@@ -208,8 +208,8 @@ def test_pods_that_mirror_each_other_are_two_modes_until_they_turn_and_told_apar
     pods = np.array([peer in ("p1", "p2") for _, peer in made.pairs])
     at = [round(seconds / SCAN_S) - 1 for seconds in (3.0, 5.0, 8.0, 12.0)]
     doubtful = (made.ambiguity[:, pods] >= 0.05) | (made.weights[:, pods] < 0.95)
-    assert doubtful[at].all(), f"seeds {seeds}"
-    assert doubtful[20:120].mean() > 0.95, f"seeds {seeds}"
+    assert doubtful[at].all(axis=0).mean() >= sized(1.0, 0.85), f"seeds {seeds}"
+    assert doubtful[20:120].mean() > sized(0.95, 0.85), f"seeds {seeds}"
     assert made.right(20.0, pods) >= sized(0.75, 0.9), f"seeds {seeds}"
     assert np.mean(made.weights[-1, pods] > 0.95) > 0.5, f"seeds {seeds}"
 
