@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from agent.estimation.gaussian import quadratic_form, wrap_components
 from agent.estimation.motion import STATES
 from agent.settings import HealthSettings
+from network.bearing_messages import BearingReport
 from network.leader_messages import LeaderReport
 from network.messages import (
-    BearingReport,
     Body,
     JointSnapshot,
     PairReply,

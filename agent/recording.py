@@ -27,12 +27,20 @@ from agent.core import Agent
 from agent.effects import Effect, Persist
 from agent.events import Event
 from agent.saved_state import begun_again
+from network import bearing_messages, leader_messages, life_messages, relative_messages
 from network import messages as message_types
-from network import relative_messages
 
 _TYPES: dict[str, type] = {
     name: value
-    for module in (message_types, relative_messages, event_types, effect_types)
+    for module in (
+        message_types,
+        life_messages,
+        bearing_messages,
+        leader_messages,
+        relative_messages,
+        event_types,
+        effect_types,
+    )
     for name, value in vars(module).items()
     if isinstance(value, type) and is_dataclass(value)
 }

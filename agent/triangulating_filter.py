@@ -22,7 +22,8 @@ from agent.rounds import Reports, RoundClock, Told
 from agent.saved_state import Saved
 from agent.settings import AgentSettings
 from agent.triangulator import Triangulator
-from network.messages import BearingReport, Body, Channel, Epoch, Measurement
+from network.bearing_messages import BearingReport
+from network.messages import Body, Channel, Epoch, Measurement
 
 Array = NDArray[np.float64]
 

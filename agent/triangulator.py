@@ -28,7 +28,8 @@ from agent.plausible import FARTHEST
 from agent.rounds import Told as Heard
 from agent.settings import AgentSettings, TargetSettings
 from agent.tracks import track_ended
-from network.messages import MAX_MESSAGE_BYTES, Bearing, BearingReport, Prediction
+from network.bearing_messages import Bearing, BearingReport, Prediction
+from network.messages import MAX_MESSAGE_BYTES
 from network.wire import size_bound
 
 Array = NDArray[np.float64]

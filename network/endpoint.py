@@ -25,15 +25,12 @@ from collections import Counter
 from dataclasses import dataclass
 
 from network.leader_messages import LeaderReport, LeaderRequest
+from network.life_messages import MAX_ECHOES, ClockEcho, Hello, LifeNotice
 from network.messages import (
-    MAX_ECHOES,
     MAX_MESSAGE_BYTES,
     Body,
     Channel,
-    ClockEcho,
     Header,
-    Hello,
-    LifeNotice,
     Message,
     Packet,
     PairReply,

@@ -18,7 +18,8 @@ from typing import Any, Literal
 import msgpack
 
 from network.faults import FOREVER_NS, Parcel, corrupted
-from network.messages import Channel, Header, Hello, Packet
+from network.life_messages import Hello
+from network.messages import Channel, Header, Packet
 from network.wire import encode
 
 Content = Literal["damaged", "hostile", "replayed", "stranger"]

@@ -12,7 +12,9 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from network.bearing_messages import BearingReport
 from network.leader_messages import LeaderReport, LeaderRequest
+from network.life_messages import Hello, LifeNotice
 from network.relative_messages import HypothesesReport, MotionReport
 
 Array = NDArray[np.float64]
@@ -35,7 +37,6 @@ MAX_GROUP = 3
 
 MAX_TARGETS = 8
 MAX_MEASUREMENTS = 8
-MAX_ECHOES = 16
 
 MAX_RECKONINGS = 4
 MAX_RAW_MEASUREMENTS = 16
@@ -88,37 +89,6 @@ class Epoch:
 
 
 NEVER = Epoch()
-
-
-@dataclass(frozen=True, slots=True)
-class ClockEcho:
-    """First half of a four-stamp exchange: `t1_ns` peer's send stamp (its clock), `t2_ns` our receive stamp."""
-
-    peer: str
-    t1_ns: int
-    t2_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class Hello:
-    """Periodic sign of life (2 Hz) with clock echoes for the neighbours heard."""
-
-    software: str
-    echoes: tuple[ClockEcho, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class LifeNotice:
-    """To one of two processes that send under one id; it is directed to that robot, so both are told.
-
-    boot_id      of the process that is meant
-    incarnation  of the life that the sender goes on with
-    over         the life of the process that is meant is refused, and the one the sender goes on with is silent
-    """
-
-    boot_id: int
-    incarnation: int
-    over: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -377,42 +347,6 @@ class RoundReport:
     yaw_rate: float
     targets: tuple[TargetBelief, ...] = ()
     corrections: tuple[Correction, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Bearing:
-    """The direction in which a camera sees a target, and from where.
-
-    place      (3,) of the camera [m], ENU, at the instant of the sighting
-    place_cov  (3, 3) of its error [m^2]
-    direction  (3,) unit vector, ENU
-    sigma_rad  deviation of the direction along any axis across it, with what the camera's attitude is unsure of
-    age_ns     from the sighting to the report's instant
-    """
-
-    target: str
-    place: Array
-    place_cov: Array
-    direction: Array
-    sigma_rad: float
-    age_ns: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
-    """Position and velocity (6,) of a target, ENU, predicted for a report's instant; its cov (6, 6) if that is told."""
-
-    target: str
-    mean: Array
-    cov: Array | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BearingReport:
-    """What one robot tells everybody in reach once per round, at the header's `t_meas_ns`, to triangulate targets."""
-
-    bearings: tuple[Bearing, ...]
-    predictions: tuple[Prediction, ...] = ()
 
 
 Body = (

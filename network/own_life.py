@@ -9,7 +9,7 @@ A life lasts `MIN_LIFE_NS` at least: at that pace two processes take turns that 
 
 from __future__ import annotations
 
-from network.messages import LifeNotice
+from network.life_messages import LifeNotice
 
 MIN_LIFE_NS = 10_000_000_000
 MAX_INCARNATION = 2**40

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import Counter, deque
 
 from network.clock import PeerClock
-from network.messages import LifeNotice
+from network.life_messages import LifeNotice
 
 WINDOW = 1024
 DOUBLED_AFTER = 3

@@ -15,21 +15,18 @@ from typing import Any
 import msgpack
 import numpy as np
 
+from network.bearing_messages import BearingReport
 from network.leader_messages import LeaderReport, LeaderRequest
+from network.life_messages import MAX_ECHOES, ClockEcho, Hello, LifeNotice
 from network.messages import (
-    MAX_ECHOES,
     MAX_JOINT_DIM,
     MAX_MEASUREMENTS,
     MAX_MESSAGE_BYTES,
     SCHEMA,
-    BearingReport,
     Body,
-    ClockEcho,
     Epoch,
     Header,
-    Hello,
     JointSnapshot,
-    LifeNotice,
     Measurement,
     Message,
     PairReply,

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from network.messages import MAX_TARGETS, Bearing, BearingReport, Header, Prediction
+from network.bearing_messages import Bearing, BearingReport, Prediction
+from network.messages import MAX_TARGETS, Header
 from network.wire_fields import (
     BELIEF_FLOOR,
     SENSOR_FLOOR,

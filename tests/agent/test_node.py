@@ -19,7 +19,8 @@ from agent.node import Node, Outgoing, rejected
 from agent.sensor_input import ABSOLUTE_KINDS, SIZES, SensorConfig, encode
 from agent.settings import AgentSettings
 from network.endpoint import EndpointSettings
-from network.messages import Channel, LifeNotice, Packet
+from network.life_messages import LifeNotice
+from network.messages import Channel, Packet
 from network.wire import OversizeError
 
 S = 1_000_000_000

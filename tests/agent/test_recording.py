@@ -35,13 +35,12 @@ from agent.recording import (
     replay,
     unpack,
 )
+from network.life_messages import ClockEcho, Hello
 from network.messages import (
     Belief,
     Channel,
-    ClockEcho,
     Epoch,
     Header,
-    Hello,
     Line,
     Measurement,
     Message,

@@ -12,7 +12,8 @@ from agent.effects import Broadcast
 from agent.estimation.motion import CONSTANT_VELOCITY_3D, SpatialMotion, TargetMotion
 from agent.events import LinkChange, Observation, Odometry, Received, Tick
 from agent.settings import NS, AgentSettings, LocalizationSettings, RoundSettings, TargetSettings, TrackingSettings
-from network.messages import MAX_MESSAGE_BYTES, Bearing, BearingReport, Header, Message, Prediction
+from network.bearing_messages import Bearing, BearingReport, Prediction
+from network.messages import MAX_MESSAGE_BYTES, Header, Message
 from network.wire import size_bound
 
 PERIOD_NS, WAIT_NS = NS // 10, NS // 50

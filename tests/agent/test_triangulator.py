@@ -15,7 +15,7 @@ from agent.estimation.triangulation import transition
 from agent.rounds import Told
 from agent.settings import NS, AgentSettings, LocalizationSettings, RoundSettings, TargetSettings, TrackingSettings
 from agent.triangulator import Triangulator
-from network.messages import Bearing, BearingReport
+from network.bearing_messages import Bearing, BearingReport
 from tests.sizes import sized
 
 Array = NDArray[np.float64]

@@ -14,7 +14,8 @@ import numpy as np
 
 from agent.node import Node, Outgoing
 from network.endpoint import Delivery, Endpoint, EndpointSettings
-from network.messages import Channel, Header, Hello, Packet
+from network.life_messages import Hello
+from network.messages import Channel, Header, Packet
 from network.peers import MAX_PEERS
 from network.wire import decode, encode, peek_header
 from network.wire_fields import WireError

@@ -20,17 +20,14 @@ from network.endpoint import (
     PeerChange,
     PeerDoubled,
 )
+from network.life_messages import MAX_ECHOES, ClockEcho, Hello, LifeNotice
 from network.messages import (
-    MAX_ECHOES,
     MAX_MESSAGE_BYTES,
     NEVER,
     Belief,
     Channel,
-    ClockEcho,
     Epoch,
     Header,
-    Hello,
-    LifeNotice,
     Packet,
     PairReply,
     ReplyStatus,

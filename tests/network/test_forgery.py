@@ -6,7 +6,8 @@ import pytest
 
 from network.endpoint import Endpoint, EndpointSettings
 from network.forgery import Content, Forger, Forgery
-from network.messages import Channel, Hello, Packet
+from network.life_messages import Hello
+from network.messages import Channel, Packet
 from network.wire import decode
 from network.wire_fields import WireError
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from network.injected_transport import LinkInjector
+from network.life_messages import Hello
 from network.links import LinkModel, LinkSettings, packet_fate
-from network.messages import Channel, Header, Hello, Packet
+from network.messages import Channel, Header, Packet
 from network.wire import encode
 
 MS = 1_000_000

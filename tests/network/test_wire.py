@@ -14,9 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from network.bearing_messages import Bearing, BearingReport, Prediction
 from network.leader_messages import LeaderReport, LeaderRequest
+from network.life_messages import MAX_ECHOES, ClockEcho, Hello, LifeNotice
 from network.messages import (
-    MAX_ECHOES,
     MAX_GROUP,
     MAX_JOINT_DIM,
     MAX_LINES,
@@ -26,23 +27,17 @@ from network.messages import (
     MAX_TARGETS,
     NEVER,
     NO_MOUNT,
-    Bearing,
-    BearingReport,
     Belief,
     Body,
-    ClockEcho,
     Correction,
     Epoch,
     Header,
-    Hello,
     JointSnapshot,
-    LifeNotice,
     Line,
     Measurement,
     Message,
     PairReply,
     PairRequest,
-    Prediction,
     RawMeasurement,
     Reckoning,
     ReplyStatus,

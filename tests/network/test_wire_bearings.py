@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from agent.plausible import plausible
-from network.messages import BearingReport, Prediction
+from network.bearing_messages import BearingReport, Prediction
 from network.wire import decode, encode
 from tests.network.test_wire import HEADER, example_bearings
 
