@@ -8,7 +8,8 @@ from typing import Any
 from agent.config import AgentConfig
 from agent.config_file import validate
 from sim.scenario import RobotPart, Scenario, sensor_kind, target_sensor
-from sim.world import World, control_odometry
+from sim.sensor_noise import control_odometry
+from sim.world import World
 
 FLEET = "sim"
 

@@ -22,7 +22,8 @@ from sim.noise import normal_rows
 from sim.recordings import LOADERS
 from sim.recordings.recording import Recording, Sightings
 from sim.scenario import SPATIAL_FORMATS, RobotPart, Scenario, SensorPart, sensor_kind
-from sim.world import Output, absolute_noise, control_odometry, order, phase_of, relative_noise, start_belief
+from sim.sensor_noise import absolute_noise, control_odometry, relative_noise
+from sim.world import Output, order, phase_of, start_belief
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,6 @@ from agent.estimation.gain_motion import reported
 from agent.estimation.gaussian import wrap, wrap_components
 from agent.estimation.motion import LAYOUTS, PLANAR, SPATIAL, UNICYCLE_GAINS
 from agent.estimation.observation import RELATIVE_ANGLES, AbsoluteModel, OutOfViewError
-from agent.estimation.odometry import OdometryNoise
 from agent.settings import NS, nanoseconds
 from agent.timeline import Phase
 from sim.arcs import flown
@@ -27,6 +26,7 @@ from sim.motion import driven
 from sim.noise import generator, normal_rows, uniform_rows
 from sim.placement import draw_phases, draw_spread, spread_pose
 from sim.scenario import RobotPart, Scenario, SensorPart, TargetPart, sensor_kind
+from sim.sensor_noise import absolute_noise, control_odometry, relative_noise
 from sim.sight import places, sights, steps_between
 from sim.steering import steered
 
@@ -97,13 +97,6 @@ class World(Protocol):
         ...
 
 
-def control_odometry(robot: RobotPart, step_s: float) -> OdometryNoise:
-    """The odometry noise a robot's estimator assumes: stated, or that of its control noise."""
-    if robot.odometry is not None:
-        return robot.odometry.noise()
-    return robot.noise.odometry(step_s, robot.vehicle.flies)
-
-
 def order(output: Output) -> tuple[int, int, str, str]:
     """Sorting key of data: instant, phase, robot, subject."""
     return (output.t_ns, int(output.phase), output.robot, output.of or "")
@@ -114,29 +107,6 @@ def phase_of(of: str | None) -> Phase:
     if of is None or of.startswith("landmark:"):
         return Phase.PRIVATE
     return Phase.TARGET if of.startswith("target:") else Phase.PAIR
-
-
-def relative_noise(kind: str, sensor: SensorPart, distance_m: float) -> Array:
-    """R (m, m) of a relative measurement at a distance."""
-    sigma_m = (sensor.sigma_m or 0.0) + sensor.sigma_m_per_m * distance_m
-    sigma_rad, sigma_px = sensor.sigma_rad or 0.0, sensor.sigma_px or 0.0
-    diagonal = {
-        "range": [sigma_m],
-        "bearing": [sigma_rad],
-        "bearing3": [sigma_rad, sigma_rad],
-        "pixel": [sigma_px, sigma_px],
-        "range_bearing": [sigma_m, sigma_rad],
-        "vector": [sigma_m, sigma_m],
-    }[kind]
-    return np.diag(np.square(diagonal))
-
-
-def absolute_noise(kind: str, sensor: SensorPart, spatial: bool = False) -> Array:
-    """R (m, m) of an absolute fix; `spatial` ones have an altitude."""
-    m, rad = sensor.sigma_m or 0.0, sensor.sigma_rad or 0.0
-    z = m if sensor.sigma_z_m is None else sensor.sigma_z_m
-    place = [m, m, z] if spatial else [m, m]
-    return np.diag(np.square({"position": place, "pose": [*place, rad], "heading": [rad], "altitude": [z]}[kind]))
 
 
 class SimulatedWorld:

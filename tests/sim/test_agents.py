@@ -13,8 +13,8 @@ from agent.estimation.mounting import planar_mount
 from sim.agents import agent_config, agent_tables, odometry_table, table
 from sim.scenario import Scenario
 from sim.scenario_file import load
+from sim.sensor_noise import control_odometry
 from sim.trial import open_world
-from sim.world import control_odometry
 
 
 def configured(*overrides: str) -> tuple[Scenario, dict[str, Any]]:

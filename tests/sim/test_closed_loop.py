@@ -16,8 +16,9 @@ from agent.estimation.motion import RobotMotion, between
 from agent.settings import NS
 from sim.agents import odometry_table
 from sim.closed_loop import MotionWriter
+from sim.sensor_noise import control_odometry
 from sim.trial import played_world
-from sim.world import Output, SimulatedWorld, control_odometry
+from sim.world import Output, SimulatedWorld
 from tests.sim.steered import SHARES, scenario
 from tests.sizes import sized
 

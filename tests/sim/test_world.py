@@ -17,7 +17,8 @@ from sim.placement import draw_phases
 from sim.scenario import Scenario
 from sim.scenario_checks import check
 from sim.scenario_file import load
-from sim.world import Output, SimulatedWorld, control_odometry, order
+from sim.sensor_noise import control_odometry
+from sim.world import Output, SimulatedWorld, order
 
 Array = NDArray[np.float64]
 RANGE = {"of": ["peers"], "sigma_m": 0.1}
