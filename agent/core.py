@@ -14,8 +14,8 @@ from contextlib import contextmanager
 import numpy as np
 
 from agent.cooperative_filter import AnonymousFilter, Completing, CooperativeFilter
-from agent.effects import Alarm, Effect, Estimate, Persist, Publish, Send
-from agent.estimation.observation import RELATIVE_ANGLES, OutOfViewError
+from agent.effects import Alarm, Effect, Estimate, Publish
+from agent.estimation.observation import OutOfViewError
 from agent.events import (
     ClockJudged,
     ControlReport,
@@ -32,11 +32,13 @@ from agent.figures import MAX_KINDS, Figures, known
 from agent.forms import build_filter
 from agent.health import Health
 from agent.instant import Instant
+from agent.own_data import placed_observation
 from agent.peer_work import PeerWork
+from agent.persistence import Persistence, saved_bytes
 from agent.pilot import Pilot
 from agent.plausible import plausible
 from agent.replay import MAX_LOGGED, ReplayLog
-from agent.saved_state import decode, encode
+from agent.saved_state import decode
 from agent.settings import AgentSettings
 from agent.timeline import MAX_INCREMENTS, MAX_WAITING, Item, OdometryTrack, Phase, Timeline
 from agent.waiting_filter import WaitingFilter
@@ -63,10 +65,8 @@ class Agent:
         self._odometry = OdometryTrack(settings.coast, settings.lateness.tolerance_ns, self.counters)
         saved = None if restored is None else restored.saved
         self.health = Health(settings.health, self.counters, None if restored is None else restored.verdicts)
-        figures = self.figures
-        self.filter: CooperativeFilter = build_filter(
-            settings, figures.counters, figures.count_nis, self.health, saved
-        )
+        count_nis = self.figures.count_nis
+        self.filter: CooperativeFilter = build_filter(settings, self.counters, count_nis, self.health, saved)
         self._log: ReplayLog | None = None
         if replayed:
             self._log = ReplayLog(lateness.horizon_ns, lateness.tolerance_ns, self.filter.t_ns, self.counters)
@@ -74,8 +74,7 @@ class Agent:
         self._again_until_ns = self.filter.t_ns
         self._replays = self._replaying()
         self._commit()
-        self._persisted: object = None
-        self._persist_due_ns = self.now_ns
+        self._persistence = Persistence(self.now_ns)
         self._published: object = None
         self._tracks: tuple[str, ...] = ()
         self._missing: tuple[str, ...] = ()
@@ -110,38 +109,21 @@ class Agent:
             estimate = self.estimate()
             if estimate is not None:
                 effects.append(Publish(estimate))
-                self._tell_ends(tuple(track.target for track in estimate.tracks), effects)
+                tracks = tuple(track.target for track in estimate.tracks)
+                effects.extend(Alarm("track_ended", target) for target in self._tracks if target not in tracks)
+                self._tracks = tracks
         verdicts = self.health.alarms()
         effects.extend(verdicts)
         missing = self.missing()
         if missing != self._missing:
             self._missing = missing
             effects.append(Alarm("waiting", "; ".join(missing)) if missing else Alarm("started"))
-        self._persist(effects, bool(verdicts))
+        self._persistence.act(self.settings, self.filter, self.health, self.now_ns, effects, bool(verdicts))
         return effects
-
-    def _persist(self, effects: list[Effect], judged: bool) -> None:
-        """Have the state kept: before messages that it must not be older than, with new verdicts, from time to time."""
-        first = next((index for index, effect in enumerate(effects) if isinstance(effect, Send)), None)
-        ahead = first is not None and self.filter.keeps_factors and not self.settings.unsafe.send_before_saving
-        due = self.now_ns >= self._persist_due_ns and self.filter.revision is not self._persisted
-        if not ahead and not due and not judged:
-            return
-        payload = self.saved()
-        if payload is None:
-            return
-        self._persisted, self._persist_due_ns = self.filter.revision, self.now_ns + self.settings.persist_ns
-        effects.insert(first if ahead and first is not None else len(effects), Persist(payload, ahead))
 
     def saved(self) -> bytes | None:
         """What is known now, for another life of this robot; None if it begins without."""
-        saved = self.filter.saved()
-        return None if saved is None else encode(self.settings, saved, self.health.saved())
-
-    def _tell_ends(self, tracks: tuple[str, ...], effects: list[Effect]) -> None:
-        if tracks != self._tracks:
-            effects.extend(Alarm("track_ended", target) for target in self._tracks if target not in tracks)
-            self._tracks = tracks
+        return saved_bytes(self.settings, self.filter, self.health)
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """What waits or is kept, and the most there may be of it, by name."""
@@ -265,22 +247,15 @@ class Agent:
                 log.drop(item)
 
     def _queue_observation(self, event: Observation) -> None:
-        if event.kind not in RELATIVE_ANGLES:
-            self.counters["observation.unknown_kind"] += 1
-        elif event.of is None and self.settings.relative.leads and isinstance(self.filter, AnonymousFilter):
-            self._queue(Item(event.t_meas_ns, Phase.PAIR, "", event))
-        elif event.of is None:
-            self.counters["observation.no_identity"] += 1
-        elif event.of.startswith("landmark:"):
-            self._queue(Item(event.t_meas_ns, Phase.PRIVATE, event.of, event))
-        elif event.of.startswith("target:"):
-            self._queue(Item(event.t_meas_ns, Phase.TARGET, event.of, event))
-        elif event.of == self.settings.robot:
-            self.counters["observation.of_self"] += 1
-        else:
-            if self._pilot is not None:
-                self._pilot.saw(event.of, event)
-            self._queue(Item(event.t_meas_ns, Phase.PAIR, event.of, event))
+        settings = self.settings
+        takes_unnamed = settings.relative.leads and isinstance(self.filter, AnonymousFilter)
+        item = placed_observation(event, settings.robot, takes_unnamed)
+        if isinstance(item, str):
+            self.counters[item] += 1
+            return
+        if self._pilot is not None and event.of is not None and item.phase is Phase.PAIR:
+            self._pilot.saw(event.of, event)
+        self._queue(item)
 
     def _receive(self, event: Received, effects: list[Effect]) -> None:
         peer, body = event.message.header.source, event.message.body

@@ -95,7 +95,8 @@ def test_with_factors_it_does_the_same_for_twenty_seconds_bit_for_bit(form: str,
     base = replace(team.settings[robot], start_ns=team.now_ns + NS, mean=np.ones(3))
     twin = team.twins[robot] = Agent(base, payload)
     # When the next state is due is not kept.
-    twin._persist_due_ns, twin._persisted = team.agents[robot]._persist_due_ns, twin.filter.revision
+    twin._persistence.due_ns = team.agents[robot]._persistence.due_ns
+    twin._persistence.revision = twin.filter.revision
     twin._published, twin._tracks = twin.filter.revision, team.agents[robot]._tracks
     assert twin.saved() == payload
     assert twin.filter.contacts() == team.agents[robot].filter.contacts() != {}
