@@ -105,8 +105,11 @@ class RecordingWriter:
 
     def __init__(self, path: Path) -> None:
         self._file: BinaryIO = path.open("wb")
-        # Small chunks: a writer that is killed loses only the last one.
-        self._writer = Writer(self._file, chunk_size=1 << 14, compression=CompressionType.NONE)
+        # Small chunks: a writer that is killed loses only the last one. Chunks have checksums anyway; that of all data
+        # covers what is between them too, configurations above all.
+        self._writer = Writer(
+            self._file, chunk_size=1 << 14, compression=CompressionType.NONE, enable_data_crcs=True
+        )
         self._writer.start(profile="cofix", library="cofix")
         self._channels: dict[str, int] = {}
         self._sequence = 0
