@@ -41,9 +41,10 @@ class _Entry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CourseMark:
-    """A newest belief, and the left factor of updates at its instant."""
+    """A newest belief, the left factor of the motion that led to it, and that of updates at its instant."""
 
     moment: Moment
+    F: Array
     after: Array
 
 
@@ -78,13 +79,13 @@ class Course:
     def mark(self) -> CourseMark:
         """The newest belief as it is."""
         entry = self._entries[-1]
-        return CourseMark(entry.moment, entry.after)
+        return CourseMark(entry.moment, entry.F, entry.after)
 
     def rewind(self, mark: CourseMark) -> None:
         """Forget what came after a mark, before whose instant nothing was changed since."""
         index = bisect_left(self._stamps, mark.moment.t_ns)
         del self._entries[index + 1 :], self._stamps[index + 1 :]
-        self._entries[index].moment, self._entries[index].after = mark.moment, mark.after
+        self._entries[index] = _Entry(mark.moment, mark.F, mark.after)
 
     def next_after(self, t_ns: int) -> Moment | None:
         """The belief of the oldest instant that is later than `t_ns`; None if there is none."""
@@ -95,6 +96,11 @@ class Course:
         """The belief of the newest instant that is not later than `t_ns`; None if that has been forgotten."""
         index = bisect_right(self._stamps, t_ns + self._tolerance_ns) - 1
         return None if index < 0 else self._entries[index].moment
+
+    def begin_anew(self, mean: Array, cov: Array) -> None:
+        """The newest belief is mean (n,), cov (n, n) by other information, and nothing before it tells more."""
+        unit = identity(len(mean))
+        self._entries[-1] = _Entry(Moment(self.newest.t_ns, mean, cov), np.zeros_like(unit), unit)
 
     def correct(self, before: Moment, mean: Array, cov: Array) -> bool:
         """Have mean (n,), cov (n, n) take the place of `before`, and all later beliefs follow.

@@ -3,12 +3,15 @@
 `replay` is none of its business: the core leads the filter back then (`agent.replay`). The policies are those of Zhang
 & Cao 2019, whose kernels are in `agent.estimation.delayed`, and two that everybody has at hand: `ignore`, which takes
 what comes late as if of now, and `discard`. A measurement is dealt with by the policy that was on when it was made.
+
+All of them linearize at the heading that is believed. A follower that has none, as after a while without its odometry,
+uses no word by itself: it gathers a few, and begins its pose anew from them (`agent.estimation.pose_from_words`).
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +29,32 @@ from agent.estimation.delayed import (
     corrected,
     equivalent,
 )
+from agent.estimation.gaussian import is_positive_definite
+from agent.estimation.pose_from_words import Way, no_way, pose_from_words
 from agent.events import Completed
 from agent.settings import LatenessSettings
 
 Array = NDArray[np.float64]
 
 Key = tuple[int, bytes]
-UnderWay = dict[Key, InFlight]
+Gathered = dict[Key, tuple[Way, LeaderSight | None]]
 
 MAX_FLIGHTS = 256
+MAX_GATHERED = 64
+
+LOST_RAD = 0.5
+"""Deviation of a heading from which on it is none."""
+
+FOUND_RAD = 0.2
+"""Deviation of a heading that a pose may be begun with."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UnderWay:
+    """What a rewind needs: measurements in flight; without a heading, ways since measurements and what they tell."""
+
+    flights: dict[Key, InFlight]
+    gathered: Gathered
 
 
 class LateWords:
@@ -42,12 +62,16 @@ class LateWords:
 
     def __init__(self, lateness: LatenessSettings, start_ns: int, course: Course, counters: Counter[str]) -> None:
         self._lateness, self._start_ns, self._course, self._counters = lateness, start_ns, course, counters
-        self._flights: UnderWay = {}
+        self._flights: dict[Key, InFlight] = {}
+        self._gathered: Gathered = {}
         self._fresh: dict[Key, LeaderSight] = {}
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """What is kept, and the most there may be of it, by name."""
-        return {"leader.flights": (len(self._flights), MAX_FLIGHTS)}
+        return {
+            "leader.flights": (len(self._flights), MAX_FLIGHTS),
+            "leader.gathered": (len(self._gathered), MAX_GATHERED),
+        }
 
     def policy(self, t_ns: int) -> str:
         """The policy that is on at an instant."""
@@ -57,16 +81,21 @@ class LateWords:
 
     def under_way(self) -> UnderWay:
         """What a rewind to the present instant needs."""
-        return dict(self._flights)
+        return UnderWay(dict(self._flights), dict(self._gathered))
 
     def restore(self, found: UnderWay) -> None:
         """Return to what was under way."""
-        self._flights = dict(found)
+        self._flights, self._gathered = dict(found.flights), dict(found.gathered)
 
     def measured(self, t_ns: int, z: Array, sight: LeaderSight | None) -> None:
         """The leader is measured at the present instant: z (2,). `sight` has no place yet, and the covariance that is
         expected of its word; None: there was no word yet, so that nothing can be expected."""
-        if self.policy(t_ns) not in ("compensate", "algorithm1", "equivalent"):
+        if self.policy(t_ns) not in ("compensate", "algorithm1", "equivalent", "ignore"):
+            return
+        if self._lost():
+            self._gather(_key(t_ns, z), None)
+            return
+        if self.policy(t_ns) == "ignore":
             return
         if len(self._flights) >= MAX_FLIGHTS:
             self._counters["leader.too_many"] += 1
@@ -89,8 +118,9 @@ class LateWords:
                 self._counters["leader.anticipated"] += 1
         self._fresh.clear()
 
-    def moved(self, F: Array, delta: Array) -> None:
-        """A prediction with left factor F (n, n) by an increment (3,)."""
+    def moved(self, F: Array, delta: Array, noise: Array) -> None:
+        """A prediction with left factor F (n, n) by an increment (3,) with covariance (3, 3)."""
+        self._gathered = {key: (way.moved(delta, noise), told) for key, (way, told) in self._gathered.items()}
         self._flights = {key: flight.moved(F, delta) for key, flight in self._flights.items()}
 
     def updated(self, left: Array) -> None:
@@ -111,6 +141,9 @@ class LateWords:
         flight, policy = self._flights.pop(key, None), self.policy(item.t_meas_ns)
         self._fresh.pop(key, None)
         late = item.t_meas_ns < now.t_ns - self._lateness.tolerance_ns
+        if self._lost() and (flight is None or flight.gain is None) and not (late and policy == "discard"):
+            self._begin_anew(key, sight, late)
+            return None
         if not late:
             return self._taken(now, corrected(now.mean, now.cov, sight, iterations))
         if flight is not None and flight.gain is not None:
@@ -132,6 +165,38 @@ class LateWords:
             return None
         self._counters["late.compensated"] += 1
         return self._taken(then, corrected(then.mean, then.cov, sight, iterations))
+
+    def _lost(self) -> bool:
+        """Whether the follower has no heading; once it has one, what was gathered is over."""
+        if float(self._course.newest.cov[2, 2]) > LOST_RAD**2:
+            return True
+        self._gathered.clear()
+        return False
+
+    def _gather(self, key: Key, told: LeaderSight | None) -> None:
+        way, _ = self._gathered.pop(key, (no_way(), None))
+        if len(self._gathered) >= MAX_GATHERED:
+            del self._gathered[next(iter(self._gathered))]
+        self._gathered[key] = way, told
+
+    def _begin_anew(self, key: Key, sight: LeaderSight, late: bool) -> None:
+        """A word for a follower without a heading: with those before it perhaps it tells the pose."""
+        if late and key not in self._gathered:
+            self._counters["late.dropped"] += 1
+            return
+        self._gather(key, sight)
+        self._counters["leader.gathered"] += 1
+        told = [(way, word) for way, word in self._gathered.values() if word is not None]
+        now = self._course.newest
+        clock = (float(now.mean[3]), float(now.cov[3, 3])) if len(now.mean) > 3 else None
+        found = pose_from_words([word for _, word in told], [way for way, _ in told], clock)
+        if found is None or not is_positive_definite(found[1]) or found[1][2, 2] > FOUND_RAD**2:
+            return
+        self._course.begin_anew(*found)
+        self._flights.clear()
+        self._fresh.clear()
+        self._gathered.clear()
+        self._counters["leader.begun_anew"] += 1
 
     def _taken(self, then: Moment, found: Corrected) -> Corrected | None:
         if not self._course.correct(then, found.mean, found.cov):

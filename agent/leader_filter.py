@@ -134,7 +134,7 @@ class LeaderFilter:
         now, step = self._own.newest, delta[list(PLANAR)]
         mean, after, F = moved(now.mean, now.cov, step, cov[PLANAR_SQUARE])
         self._own.advance(t_ns, Propagated(mean, after, F))
-        self._late.moved(F, step)
+        self._late.moved(F, step, cov[PLANAR_SQUARE])
         if self._voice is not None:
             self._voice.moved(t_ns, (mean[:2] - now.mean[:2]) * NS / (t_ns - now.t_ns))
         self._revision = object()
@@ -229,14 +229,16 @@ class LeaderFilter:
         sight = _sight(item, item.place, item.place_cov, item.velocity)
         if item.z[0] < NEAREST_M or float(np.hypot(*(item.place - self._own.newest.mean[:2]))) < NEAREST_M:
             raise OutOfViewError("the leader is too near for a bearing")
+        before = self._own.newest
         found = self._late.use(item, sight, self._settings.lateness.iterations)
+        if self._own.newest is not before:
+            self._revision = object()
         if found is None:
             return
         self._counters["used.leader"] += 1
         self._count_nis("leader", float(found.nis))
         leader = self._settings.localization.leader
         self._last = Epoch(item.t_meas_ns, leader, 0)
-        self._revision = object()
 
     def link_changed(self, event: LinkChange) -> None:
         life = event.incarnation, event.boot_id

@@ -101,6 +101,23 @@ def test_a_leader_that_restarts_is_followed_again() -> None:
     assert follower(results)[1] < 1.9
 
 
+@pytest.mark.parametrize("kind", ["replay", "compensate"])
+def test_a_follower_that_was_down_and_lost_its_state_begins_anew_and_claims_what_it_knows(kind: str) -> None:
+    """Nobody knows where it heads after six seconds of coasting: it gathers words until they tell a pose."""
+    crash = '[{ kind = "crash", robot = "r2", at_s = 1.0, for_s = 6.0, state = "lost" }]'
+    made = scenario("leader-follower", f"faults={crash}", f"lateness.kind={kind}", seconds=12.0)
+    values = []
+    for seed in SEEDS:
+        result = run_trial(made, seed, checker=InvariantChecker(seed))
+        trace, after = result.trace.robots["r2"], result.trace.t_s >= 7.2
+        values.append(np.nanmean(nees(trace)[after]) / 3.0)
+        assert result.counters["r2"]["leader.begun_anew"] >= 1, seed
+        assert trace.cov[-1, 2, 2] < 0.1**2, seed
+        error = np.linalg.norm((trace.mean - trace.truth)[-1, :2])
+        assert error < 0.6, (seed, error)
+    assert np.mean(values) <= 1.15, values
+
+
 # -- the world --------------------------------------------------------------------------------------------------------
 
 
