@@ -45,7 +45,7 @@ MAX_GATHERED = 64
 LOST_RAD = 0.5
 """Deviation of a heading from which on it is none."""
 
-FOUND_RAD = 0.2
+FOUND_RAD = 0.12
 """Deviation of a heading that a pose may be begun with."""
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from agent.cooperative_filter import FilterMark
 from agent.effects import Broadcast, Effect, Estimate
+from agent.estimation.gate_test import GateTest
 from agent.estimation.mounting import rotation
 from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.estimation.reckoning import extended
@@ -43,6 +44,14 @@ class RelativeFilter:
     """The kind `relative`; see `agent.cooperative_filter` for what each method is given."""
 
     keeps_factors = False
+
+    def gate_tests(self) -> tuple[int, dict[str, GateTest]]:
+        """How the last scan's bearings were judged, by peer, and the instant it has been processed to (own clock)."""
+        if self._leader is None:
+            return self.t_ns, {}
+        judge = self._leader.correspondence
+        tests = {peer: test for peer in judge.peers if (test := judge.gate_test(peer)) is not None}
+        return self._leader.t_ns, tests
 
     def __init__(self, settings: AgentSettings, counters: Counter[str], saved: SavedSplit | None = None) -> None:
         self._settings, self._counters = settings, counters

@@ -105,7 +105,7 @@ def run(options: argparse.Namespace) -> int:
         timing=timing,
         exits=exits,
     )
-    save_trace(run_dir, result.trace, result.contacts, world.landmarks, result.measured, views(scenario))
+    save_trace(run_dir, result.trace, result.contacts, world.landmarks, result.measured, views(scenario), result.gate)
     report = write_results(scenario, run_dir, summary, options.arguments, draw=not options.no_report)
     if options.json:
         print(json.dumps(summary, allow_nan=False))

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from agent.effects import RelativeEstimate
 from agent.fault_parts import AnyFaultPart
 from agent.node import Node, Outgoing, Recorder
+from agent.relative_filter import RelativeFilter
 from agent.sensor_input import encode
 from agent.settings import NS
 from network.links import FateRecord, LinkModel, RangeTable
@@ -34,6 +35,7 @@ from sim.lives import LifeSink, Process
 from sim.metrics import TrialTrace
 from sim.motion_figures import trial_motion
 from sim.reach import Reach
+from sim.relative_figures import ShownGate
 from sim.sampling import MeasurementLog, Sampler
 from sim.scenario import Scenario
 from sim.world import Output, World
@@ -77,6 +79,7 @@ class TrialResult:
     """Time of each event that ended in a command to a vehicle."""
     measured: dict[tuple[str, str], Array] = field(default_factory=dict)
     """Instants [s] at which a robot measured somebody, by (robot, of)."""
+    gate: ShownGate | None = None
 
 
 class VirtualEngine:
@@ -359,6 +362,9 @@ class VirtualEngine:
             for track in estimate.tracks:
                 self._sampler.put(robot, track.target, row, track.mean, track.cov)
             self._sampler.put_relatives(robot, row, self._since_start(process, estimate.relatives))
+            if process.node is not None and isinstance(process.node.agent.filter, RelativeFilter):
+                t_ns, tests = process.node.agent.filter.gate_tests()
+                self._sampler.put_gates(robot, process.clock.origin_ns(t_ns), tests)
         if self._bound is not None:
             for entity in (*self._world.robots, *self._world.targets):
                 self._sampler.put_bound(entity, row, self._bound.belief(entity))
@@ -388,4 +394,5 @@ class VirtualEngine:
             self.step_us,
             self.plan_us,
             measured,
+            self._sampler.gate,
         )

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from agent.effects import RelativeEstimate
+from agent.estimation.gate_test import GateTest
 from agent.estimation.gaussian import is_positive_definite, quadratic_form, wrap
 
 Array = NDArray[np.float64]
@@ -50,6 +51,17 @@ class RelativeTrace:
     tracks: Array
     confirmed: Array
     lag_s: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShownGate:
+    """How a robot has judged bearings of a peer at t_s; truth (4,): x, y, z, heading in the body frame of the robot."""
+
+    t_s: float
+    robot: str
+    peer: str
+    truth: Array
+    test: GateTest
 
 
 def blank(count: int) -> RelativeTrace:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.plots import GREY, PALE, colour, drawing, logarithmic
-from sim.relative_figures import RIGHT_M, Pair, RelativeTrace, heading_errors, place_errors, right
+from sim.relative_figures import RIGHT_M, Pair, RelativeTrace, ShownGate, heading_errors, place_errors, right
 
 Array = NDArray[np.float64]
 
@@ -58,6 +58,34 @@ def frames(traces: dict[Pair, RelativeTrace], path: Path) -> Path:
             axes.legend(loc="best", fontsize=8)
         for axes in list(grid.flat)[len(leaders) :]:
             axes.set_visible(False)
+    return path
+
+
+def gate(shown: ShownGate, path: Path) -> Path:
+    """Bearings of one scan, and what the hypotheses of one robot expected, with their gates.
+
+    As De Silva, Mann, Gosine 2015, fig. 3: the spread that linearization says, and the gate that is used, wider
+    where a heading is wide and the form is the published one.
+    """
+    test, angles = shown.test, np.linspace(0.0, 2.0 * np.pi, 90)
+    x, y, z = shown.truth[:3]
+    true = np.degrees([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
+    with drawing(path, 5.0) as figure:
+        axes = figure.subplots()
+        for expected, spread, used, weight in zip(test.expected, test.spread, test.gate, test.weight, strict=True):
+            for cov, line, shade in ((used, "-", colour(0)), (spread, ":", colour(1))):
+                root = np.linalg.cholesky(test.limit * cov)
+                edge = np.degrees(expected + (root @ np.stack([np.cos(angles), np.sin(angles)])).T)
+                axes.plot(*edge.T, color=shade, lw=1.1, ls=line, alpha=0.35 + 0.65 * float(weight))
+            axes.plot(*np.degrees(expected), marker="o", ms=3 + 6 * float(weight), color=colour(0), lw=0)
+        axes.plot(*np.degrees(test.bearings).T, marker="x", ms=7, mew=1.6, color=colour(6), lw=0, label="bearing")
+        axes.plot(*true, marker="*", ms=11, color=colour(2), lw=0, zorder=4, label=f"true direction of {shown.peer}")
+        axes.plot([], [], marker="o", ms=5, color=colour(0), lw=0, label="expected, larger if it weighs more")
+        axes.plot([], [], color=colour(0), lw=1.1, label="gate")
+        axes.plot([], [], color=colour(1), lw=1.1, ls=":", label="linearized")
+        axes.set_title(f"{shown.robot} looks for {shown.peer} at {shown.t_s:.2f} s")
+        axes.set(xlabel="azimuth [deg]", ylabel="elevation [deg]", xlim=(-190.0, 190.0), ylim=(-65.0, 65.0))
+        axes.legend(loc="upper right", fontsize=8)
     return path
 
 

@@ -144,6 +144,15 @@ def _of_relatives(stored: Stored, add: Add) -> None:
         "that is believed.",
         lambda path: relative_plots.frames(traces, path),
     )
+    shown = stored.gate
+    if shown is not None:
+        add(
+            "gate",
+            "Which bearings may be whose",
+            "One scan of a leader, and what its hypotheses of one robot expected: bearings inside a gate may be that "
+            "robot's.",
+            lambda path: relative_plots.gate(shown, path),
+        )
     add(
         "hypotheses",
         "Hypotheses and their errors",

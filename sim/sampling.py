@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.effects import RelativeEstimate
+from agent.estimation.gate_test import GateTest
 from agent.estimation.motion import LAYOUTS
 from agent.settings import NS, nanoseconds
 from sim.metrics import StateTrace, TrialTrace
-from sim.relative_figures import Pair, RelativeTrace, blank, fill, relative_state
+from sim.relative_figures import Pair, RelativeTrace, ShownGate, blank, fill, relative_state
 from sim.scenario import Scenario
 from sim.world import Output, World
 
@@ -52,6 +53,7 @@ class Sampler:
             for entity in (robot, *world.targets):
                 self._owned[robot, entity] = self._blank(entity)
         self._relatives: dict[Pair, RelativeTrace] = {}
+        self.gate: ShownGate | None = None
         self._bound = {name: self._blank(name) for name in (*world.robots, *world.targets)} if with_bound else None
 
     def _blank(self, entity: str) -> tuple[Array, Array]:
@@ -81,6 +83,16 @@ class Sampler:
             fill(trace, row, found, (self._instants[row] * self._world.step_ns - found.t_ns) / NS)
             if 0 <= k <= self._world.steps:
                 trace.truth[row] = relative_state(self._world.truth(robot, k), self._world.truth(found.peer, k))
+
+    def put_gates(self, robot: str, t_ns: int, tests: dict[str, GateTest]) -> None:
+        """How a robot has judged bearings at an instant since the start: kept is the test whose gates are wider
+        than linearized ones by most, or the first with several hypotheses."""
+        for peer, test in tests.items():
+            kept = None if self.gate is None else self.gate.test
+            if kept is None or len(kept.weight) == 1 < len(test.weight) or test.wider > 1.05 * kept.wider:
+                k = min(max(round(t_ns / self._world.step_ns), 0), self._world.steps)
+                truth = relative_state(self._world.truth(robot, k), self._world.truth(peer, k))
+                self.gate = ShownGate(t_ns / NS, robot, peer, truth, test)
 
     def put_bound(self, entity: str, row: int, belief: tuple[Array, Array] | None) -> None:
         """None: there is no belief (yet)."""

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.gate_test import GateTest
 from sim.metrics import StateTrace, TrialTrace
-from sim.relative_figures import RelativeTrace
+from sim.relative_figures import RelativeTrace, ShownGate
 from sim.sight import View
 
 FILE = "trace.npz"
+GATE_PARTS = ("bearings", "weight", "expected", "spread", "gate")
 
 Instants = dict[tuple[str, str], NDArray[np.float64]]
 """Times [s] at which a robot measured somebody, by (robot, of)."""
@@ -31,6 +33,7 @@ class Stored:
     landmarks: dict[str, tuple[float, float]]
     measured: Instants = field(default_factory=dict)
     views: dict[str, list[View]] = field(default_factory=dict)
+    gate: ShownGate | None = None
 
 
 def save_trace(
@@ -40,6 +43,7 @@ def save_trace(
     landmarks: dict[str, tuple[float, ...]],
     measured: Instants | None = None,
     views: dict[str, list[View]] | None = None,
+    gate: ShownGate | None = None,
 ) -> None:
     """Write `trace.npz`, of landmarks x and y.
 
@@ -66,6 +70,8 @@ def save_trace(
     parts = [item.name for item in fields(RelativeTrace)]
     for place, relative in enumerate(trace.relatives.values()):
         arrays |= {f"relative.{place}.{name}": getattr(relative, name) for name in parts}
+    if gate is not None:
+        arrays |= {f"gate.{name}": getattr(gate.test, name) for name in GATE_PARTS} | {"gate.truth": gate.truth}
     meta = {
         "index": index,
         "relatives": list(trace.relatives),
@@ -74,6 +80,7 @@ def save_trace(
         "bound": trace.bound is not None,
         "measured": list(measured or {}),
         "views": views or {},
+        "gate": None if gate is None else [gate.t_s, gate.robot, gate.peer, gate.test.limit],
     }
     np.savez_compressed(run_dir / FILE, meta=np.array(json.dumps(meta)), **arrays)
 
@@ -115,7 +122,12 @@ def load_trace(run_dir: Path) -> Stored | None:
             (str(robot), str(of)): np.cumsum(data[f"measured.{place}"]) * 1e-6
             for place, (robot, of) in enumerate(meta.get("measured", []))
         }
+        gate = None
+        if meta.get("gate"):
+            t_s, robot, peer, limit = meta["gate"]
+            test = GateTest(**{name: data[f"gate.{name}"] for name in GATE_PARTS}, limit=limit)
+            gate = ShownGate(t_s, robot, peer, data["gate.truth"], test)
     contacts = [(float(t), str(a), str(b)) for t, a, b in meta["contacts"]]
     landmarks = {name: (float(x), float(y)) for name, (x, y) in meta["landmarks"].items()}
     views = {name: [View(*item) for item in items] for name, items in meta.get("views", {}).items()}
-    return Stored(trace, contacts, landmarks, measured, views)
+    return Stored(trace, contacts, landmarks, measured, views, gate)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation import nearest_track
+from agent.estimation.gate_test import GateTest, gate_test
 from agent.estimation.gaussian_sum import Rules, Seen, Tracks, joined, moved, no_tracks, scanned
 from agent.estimation.gaussian_sum_doubt import distinct
 from agent.estimation.gaussian_sum_fusion import TOLD, Fusion, Told, fused, seen_back, seen_through
@@ -153,6 +154,7 @@ class Correspondence:
         self._sure_s = np.zeros(len(self.peers))
         self._bad = np.zeros(len(self.peers), dtype=np.int64)
         self._snapshot: Tracks | None = None
+        self._tested: tuple[Tracks, Seen] | None = None
 
     def advance(self, own: BodyMotion, peers: Mapping[str, BodyMotion], dt_s: float) -> None:
         """All sums dt_s later. Every peer's motion must be there: of one that was not heard, a guess with its doubt.
@@ -176,6 +178,7 @@ class Correspondence:
         labels: where identities are known, peer -> index into the bearings; a missing peer was not seen.
         """
         seen = self._seen(scan, labels)
+        self._tested = self._tracks, seen
         if self.settings.kind == "nearest":
             self._tracks, self._bad = nearest_track.scanned(self._tracks, self._bad, seen, self._rules)
         else:
@@ -183,6 +186,12 @@ class Correspondence:
             self._tracks = pruned(tracks, self._rules, families=True)
         self._snapshot = None
         self._settle(self._tracks.lineage[:, -2])
+
+    def gate_test(self, peer: str) -> GateTest | None:
+        """How the bearings of the last scan were judged for `peer`; None if there was nothing to judge."""
+        if self._tested is None:
+            return None
+        return gate_test(*self._tested, self._rules, self._index[peer])
 
     def told(self, peer: str) -> Hypotheses:
         """What the others are told of `peer`; changes nothing."""

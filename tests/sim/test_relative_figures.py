@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from agent.effects import RelativeEstimate
+from agent.estimation.gate_test import GateTest
 from sim.metrics import StateTrace, TrialTrace, combine, reduce_trial, trial_figures
 from sim.relative_figures import (
     RelativeTrace,
+    ShownGate,
     blank,
     combine_relatives,
     fill,
@@ -20,6 +22,7 @@ from sim.relative_figures import (
     relative_state,
     right,
 )
+from sim.relative_plots import gate
 from sim.store import load_trace, save_trace
 
 T_S = np.arange(0.0, 10.0, 0.1)
@@ -106,9 +109,15 @@ def test_they_are_part_of_the_summary_and_of_a_trials_row() -> None:
 
 
 def test_a_kept_trial_has_them_again(tmp_path: Path) -> None:
-    save_trace(tmp_path, whole(), [], {})
+    cov = np.tile(0.01 * np.eye(2), (2, 1, 1))
+    test = GateTest(np.ones((3, 2)), np.array([0.6, 0.4]), np.zeros((2, 2)), cov, 2.0 * cov, 9.2)
+    save_trace(tmp_path, whole(), [], {}, gate=ShownGate(0.5, "l1", "p1", TRUTH, test))
     stored = load_trace(tmp_path)
-    assert stored is not None
+    assert stored is not None and stored.gate is not None
+    assert (stored.gate.t_s, stored.gate.robot, stored.gate.peer) == (0.5, "l1", "p1")
+    assert np.array_equal(stored.gate.test.gate, test.gate) and stored.gate.test.limit == 9.2
+    assert stored.gate.test.wider == pytest.approx(2.0)
+    assert gate(stored.gate, tmp_path / "gate.png").stat().st_size > 1000
     (key, found), before = next(iter(stored.trace.relatives.items())), whole().relatives["l1", "p1"]
     assert key == ("l1", "p1")
     assert np.array_equal(found.mean, before.mean) and np.array_equal(found.confirmed, before.confirmed)
