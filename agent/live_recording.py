@@ -12,16 +12,21 @@ from agent.recording import RecordingWriter
 
 
 class LiveRecording:
-    """One life of one robot. Raises OSError if the file cannot be begun; `failure`: why it is not written any more."""
+    """One life of one robot. Raises OSError if the file cannot be opened; `failure`: why it is not written any more."""
 
     def __init__(self, path: Path, config: AgentConfig, start_ns: int) -> None:
         self._robot = config.identity.robot
         self._writer = RecordingWriter(path)
-        self._writer.add_robot(config, start_ns)
         self.failure: str | None = None
+        try:
+            self._writer.add_robot(config, start_ns)
+        except OSError as error:
+            self._fail(error)
 
     def begin_life(self, t_ns: int, state: bytes | None) -> None:
         """The robot has lived before; see `RecordingWriter.begin_life`."""
+        if self.failure is not None:
+            return
         try:
             self._writer.begin_life(self._robot, t_ns, state)
         except OSError as error:

@@ -22,6 +22,7 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path, monkeyp
 
     monkeypatch.setattr(Path, "open", full)
     recording = LiveRecording(tmp_path / "r1.mcap", config, 0)
+    recording.begin_life(0, None)
     for k in range(2_000):
         recording.record(Tick(k), [])
     assert recording.failure == "No space left on device"
