@@ -1,7 +1,7 @@
 """Which bearing of a scan is beyond doubt that of whom, by sums of Gaussians of where all robots are.
 
-A bearing r of which nobody knows whose it is counts as that of robot j if j has been as good as certain for a while,
-r is the only bearing in the gates of the tracks of j and in none of another robot's, and
+A bearing r of which nobody knows whose it is counts as that of robot j if j was as good as certain for a while, r is
+the only bearing in the gates of the tracks of j and in none of another robot's, and
 
     p = s / (s + lambda' (1 - P_D P_G)),   s = P_D sum_h w_h N(y_r; 0, S_h)
 
@@ -28,7 +28,7 @@ CERTAIN = 0.99
 
 
 def certain_labels(tracks: Tracks, seen: Seen, rules: Rules, sure: Mask) -> dict[int, int]:
-    """Robot -> bearing, by indices; `sure` (n,) whose tracks have been as good as one for a while."""
+    """Robot -> bearing, by indices; `sure` (n,) who was as good as certain for a while."""
     if seen.certain or not len(seen.bearings) or not sure.any():
         return {}
     tracks = tracks.rows(tracks.weight > HEAVY)

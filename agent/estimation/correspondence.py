@@ -36,6 +36,9 @@ OUTWEIGHED = 2.0
 CONFIRMED, CONFIRMED_RAD, CONFIRMED_S = 0.95, 0.3, 2.0
 """A robot is confirmed whose hypothesis has weighed so much, with a heading of this deviation, for so long."""
 
+DOUBTED = 0.5
+"""Bearings of a robot that was confirmed are given its name until its best hypothesis weighs less than that."""
+
 LEAST_CLUTTER = 0.1
 """False bearings per scan that are expected even of a sensor that is said to have none."""
 
@@ -153,6 +156,7 @@ class Correspondence:
         self._name = 1
         self._believed = np.zeros(len(self.peers), dtype=np.int64)
         self._sure_s = np.zeros(len(self.peers))
+        self._found = np.zeros(len(self.peers), dtype=np.bool_)
         self._bad = np.zeros(len(self.peers), dtype=np.int64)
         self._snapshot: Tracks | None = None
         self._tested: tuple[Tracks, Seen] | None = None
@@ -186,8 +190,9 @@ class Correspondence:
             self._tracks, self._bad = nearest_track.scanned(self._tracks, self._bad, seen, self._rules)
         else:
             tracks = named_numbers(self._tracks, seen, self._rules)
-            sure = self._sure_s >= CONFIRMED_S
-            found = {self.peers[of]: row for of, row in certain_labels(tracks, seen, self._rules, sure).items()}
+            self._found |= self._sure_s >= CONFIRMED_S
+            named = certain_labels(tracks, seen, self._rules, self._found)
+            found = {self.peers[of]: row for of, row in named.items()}
             tracks, self._name = sighted(tracks, seen, self._rules, self._name)
             self._tracks = pruned(tracks, self._rules, families=True)
         self._snapshot = None
@@ -263,7 +268,7 @@ class Correspondence:
         for index in range(len(self.peers)):
             rows = np.flatnonzero(tracks.of == index)
             if not len(rows):
-                self._sure_s[index] = 0.0
+                self._sure_s[index], self._found[index] = 0.0, False
                 continue
             weight = tracks.weight[rows]
             best = int(weight.argmax())
@@ -274,6 +279,7 @@ class Correspondence:
             self._believed[index] = tracks.lineage[rows[best], -1]
             if weight[best] < CONFIRMED or tracks.cov[rows[best], 0, 3, 3] > CONFIRMED_RAD**2:
                 self._sure_s[index] = 0.0
+            self._found[index] &= weight[best] >= DOUBTED
 
     def _seen(self, scan: Scan, labels: Mapping[str, int] | None) -> Seen:
         n, m = len(self.peers), len(scan.bearings)
