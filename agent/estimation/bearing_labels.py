@@ -1,7 +1,8 @@
 """Which bearing of a scan is beyond doubt that of whom, by sums of Gaussians of where all robots are.
 
 A bearing r of which nobody knows whose it is counts as that of robot j if j was as good as certain for a while, r is
-the only bearing in the gates of the tracks of j and in none of another robot's, and
+the only bearing in the gates of the tracks of j and in none of another robot's, tracks of nearly all the weight of j
+have it in their gates, and
 
     p = s / (s + lambda' (1 - P_D P_G)),   s = P_D sum_h w_h N(y_r; 0, S_h)
 
@@ -26,6 +27,9 @@ Mask = NDArray[np.bool_]
 CERTAIN = 0.99
 """Least probability against clutter."""
 
+AGREED = 0.95
+"""Least weight of a robot's tracks that have the bearing in their gates."""
+
 
 def certain_labels(tracks: Tracks, seen: Seen, rules: Rules, sure: Mask) -> dict[int, int]:
     """Robot -> bearing, by indices; `sure` (n,) who was as good as certain for a while."""
@@ -43,5 +47,8 @@ def certain_labels(tracks: Tracks, seen: Seen, rules: Rules, sure: Mask) -> dict
     unknown = int((np.bincount(tracks.of, minlength=n) == 0).sum())
     others = rules.missed * (rules.clutter + unknown * rules.anywhere)
     alone = reached & (reached.sum(axis=0) == 1) & (reached.sum(axis=1, keepdims=True) == 1)
-    robots, bearings = np.nonzero(alone & sure[:, None] & (made >= CERTAIN * (made + others)))
+    agreed = np.zeros((n, len(seen.bearings)))
+    np.add.at(agreed, tracks.of, tracks.weight[:, None] * inside)
+    certain = (made >= CERTAIN * (made + others)) & (agreed >= AGREED)
+    robots, bearings = np.nonzero(alone & sure[:, None] & certain)
     return dict(zip(robots.tolist(), bearings.tolist()))
