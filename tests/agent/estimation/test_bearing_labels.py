@@ -44,6 +44,7 @@ def tracks(*items: tuple[int, float, tuple[float, float]], sigma: float = 0.1) -
         np.broadcast_to(np.diag([sigma**2, sigma**2, sigma**2, 0.04]), (count, 1, 4, 4)).copy(),
         np.zeros(count, dtype=np.bool_),
         np.zeros((count, 4), dtype=np.int64),
+        np.zeros(count),
     )
 
 
@@ -124,14 +125,14 @@ def test_names_are_known_or_found_never_both() -> None:
 
 
 def test_a_leader_names_bearings_once_it_is_sure() -> None:
-    """Two robots pass by; the names that come out are right, and come only after the robots were told apart."""
+    """Two robots pass by; names are right, come only after the robots were told apart, and are of honest bearings."""
     rng = np.random.default_rng(7)
     leader = Correspondence(CorrespondenceSettings(clutter=0.5), ("a", "b"), "me")
     place = {"a": np.array([6.0, 3.0, 0.5]), "b": np.array([-4.0, 5.0, -0.3])}
     velocity = {"a": np.array([-0.6, 0.1, 0.0, 0.0]), "b": np.array([0.5, -0.2, 0.0, 0.0])}
     still = BodyMotion(np.zeros(4), 1e-4 * np.eye(4))
-    names, wrong, first = 0, 0, None
-    for k in range(100):
+    names, wrong, first, squares = 0, 0, None, []
+    for k in range(200):
         leader.advance(still, {peer: BodyMotion(velocity[peer], 1e-3 * np.eye(4)) for peer in place}, 0.1)
         directions, ranges, heights = [], {}, {}
         for peer in place:
@@ -148,6 +149,10 @@ def test_a_leader_names_bearings_once_it_is_sure() -> None:
         for peer, row in found.items():
             first = k if first is None else first
             names += 1
-            wrong += int(order[row]) != ("a", "b").index(peer)
+            index = ("a", "b").index(peer)
+            wrong += int(order[row]) != index
+            squares.append(float(((bearings[row] - directions[index]) ** 2).mean() / SIGMA**2))
     assert first is not None and first >= 20, "two seconds of certainty come first"
-    assert names >= 100 and wrong == 0, (names, wrong)
+    assert names >= 250 and wrong == 0, (names, wrong)
+    # Each is a chi-square of two degrees of freedom over two: what is chosen is no noisier than is stated.
+    assert abs(np.mean(squares) - 1.0) < 3.0 / math.sqrt(names), (np.mean(squares), names)
