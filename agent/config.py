@@ -362,18 +362,20 @@ def load_agent_config(path: Path) -> AgentConfig:
 
 
 def _check_relative(config: AgentConfig) -> None:
-    """What the kind `relative` needs is there, and nothing of it for another kind. Raises `ConfigError`."""
+    """What it takes to tell others apart is there, and nothing of it where nobody does. Raises `ConfigError`."""
     config.correspondence.check(config.localization, config.motion.model)
     config.correspondence.check_peers(config.identity.robot, config.localization)
-    if config.localization.kind != "relative":
+    names = config.correspondence.names(config.localization)
+    if config.localization.kind != "relative" and not names:
         return
+    what = "correspondence.kind = 'gaussian_sum'" if names else "localization.kind = 'relative'"
     kinds = {name: str(part.kind) for name, part in config.sensors.items()}
-    fixes = () if config.mavlink is None else tuple(config.mavlink.fixes)
-    check_altitude(kinds, fixes)
-    check_leader(kinds)
+    if not names:
+        check_altitude(kinds, () if config.mavlink is None else tuple(config.mavlink.fixes))
+    check_leader(kinds, what)
     for name, part in config.sensors.items():
         if part.kind in CAMERAS and any(mount_of(part.mount)[:3]):
             raise ConfigError(
-                f"sensors.{name}.mount: localization.kind = 'relative' takes a camera to sit at the body's origin; "
-                "state angles only, and let the origin be there"
+                f"sensors.{name}.mount: {what} takes a camera to sit at the body's origin; state angles only, and let "
+                "the origin be there"
             )

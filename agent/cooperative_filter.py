@@ -6,6 +6,7 @@ Instants may lie in the past of the filter's own: late data are used or counted,
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -166,4 +167,21 @@ class AnonymousFilter(Protocol):
 
     def anonymous(self, t_ns: int, event: Observation) -> None:
         """Use a measurement of somebody."""
+        ...
+
+
+@runtime_checkable
+class NamingAnonymous(Protocol):
+    """A filter that finds out whom anonymous measurements are of, and uses them as those of a peer then."""
+
+    def unowned(self, t_ns: int, peer: str, measurement: Measurement) -> None:
+        """A two-way range is known here, and used by the peer."""
+        ...
+
+    def hand_on(self, now_ns: int, unusable: Container[str], effects: list[Effect]) -> None:
+        """Open contacts for what has a name by now; not with peers that are `unusable`."""
+        ...
+
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """What waits, and the most there may be of it, by name."""
         ...

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from agent.cooperative_filter import AnonymousFilter, Completing, CooperativeFilter
+from agent.cooperative_filter import AnonymousFilter, Completing, CooperativeFilter, NamingAnonymous
 from agent.effects import Alarm, Effect, Estimate, Publish
 from agent.estimation.observation import OutOfViewError
 from agent.events import (
@@ -102,6 +102,7 @@ class Agent:
         settled_ns = self.now_ns - self.settings.lateness.settle_ns
         self.filter.settled(settled_ns if isinstance(event, Tick) else settled_ns - 1, effects)
         self.filter.expire(self.now_ns, effects)
+        self._hand_on(effects)
         if self._pilot is not None:
             self._pilot.act(self.now_ns, self.filter, effects)
         if self.filter.revision is not self._published:
@@ -128,7 +129,7 @@ class Agent:
     def sizes(self) -> dict[str, tuple[int, int]]:
         """What waits or is kept, and the most there may be of it, by name."""
         log = {} if self._log is None else self._log.sizes()
-        waiting = self.filter.sizes() if isinstance(self.filter, Completing) else {}
+        waiting = self.filter.sizes() if isinstance(self.filter, Completing | NamingAnonymous) else {}
         return {
             **log,
             **waiting,
@@ -287,6 +288,15 @@ class Agent:
         if isinstance(self.filter, Completing):
             for event in self.filter.completed():
                 self._queue(Item(event.t_meas_ns, Phase.PRIVATE, event.sensor, event))
+
+    def _hand_on(self, effects: list[Effect]) -> None:
+        """Measurements that have turned out to be of a peer open contacts."""
+        if isinstance(self.filter, NamingAnonymous):
+            try:
+                with self._told(effects):
+                    self.filter.hand_on(self.now_ns, self._clocks_off, effects)
+            except np.linalg.LinAlgError:
+                self.counters["update.failed"] += 1
 
     def _asked_ns(self, event: Received) -> int:
         """The instant that a peer's request refers to, on the own clock."""

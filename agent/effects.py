@@ -80,6 +80,16 @@ class Estimate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Named:
+    """A measurement `z` of nobody knows whom, of a sensor at `t_meas_ns`, has been used as one of `peer`."""
+
+    peer: str
+    t_meas_ns: int
+    sensor: str
+    z: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Publish:
     """Something to show outside: the estimate with its tracks."""
 
@@ -118,4 +128,4 @@ class Steer:
     until_ns: int
 
 
-Effect = Send | Broadcast | Publish | Alarm | Persist | Steer
+Effect = Send | Broadcast | Named | Publish | Alarm | Persist | Steer

@@ -14,6 +14,7 @@ from agent.health import Health
 from agent.jlatt_filter import JlattFilter
 from agent.joint_filter import JointFilter
 from agent.leader_filter import LeaderFilter
+from agent.naming_filter import NamingFilter
 from agent.relative_filter import RelativeFilter
 from agent.replica_filter import ReplicaFilter
 from agent.saved_state import Saved, SavedFactors, SavedSplit
@@ -32,14 +33,32 @@ def build_filter(
 ) -> CooperativeFilter:
     """The filter of `settings.localization`; of a robot that does not know where it is, one that waits for it.
 
-    Who tracks by bearings of many has one that knows no targets, and a triangulator beside it. `saved`: what it begins
-    with, which is of the form of the settings (`agent.saved_state.decode`). The kinds `replica` and `leader` judge no
-    peer.
+    Who tracks by bearings of many has one that knows no targets, and a triangulator beside it; who finds out whom its
+    camera sees, that beside both. `saved`: what it begins with, which is of the form of the settings
+    (`agent.saved_state.decode`). The kinds `replica` and `leader` judge no peer.
     """
+    found = _tracking(settings, counters, count_nis, health, saved)
+    names = _names(settings) and not isinstance(found, WaitingFilter)
+    return NamingFilter(found, settings, counters) if names else found
+
+
+def _tracking(
+    settings: AgentSettings,
+    counters: Counter[str],
+    count_nis: Callable[[str, float], None],
+    health: Health,
+    saved: Saved | None,
+) -> CooperativeFilter:
+    """The filter that localizes, and tracks targets."""
     if settings.tracking.kind == "own" or not settings.track:
         return _localizing(settings, counters, count_nis, health, saved)
     own = _localizing(replace(settings, track=False), counters, count_nis, health, saved)
     return own if isinstance(own, WaitingFilter) else TriangulatingFilter(own, settings, counters)
+
+
+def _names(settings: AgentSettings) -> bool:
+    """Whether the robot, or one of its peers, finds out whom its camera sees while it localizes by contacts."""
+    return settings.localization.kind == "clat" and bool(settings.relative.peers) and not settings.relative.known
 
 
 def _localizing(

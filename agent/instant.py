@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from agent.cooperative_filter import AnonymousFilter, Completing, CooperativeFilter
+from agent.cooperative_filter import AnonymousFilter, Completing, CooperativeFilter, NamingAnonymous
 from agent.effects import Effect
 from agent.estimation.observation import absolute_model, relative_model, told
 from agent.events import Completed, Fix, Observation, Received
@@ -87,6 +87,8 @@ class Instant:
             two_way = found.kind == "range" and found.sensor not in self.settings.one_way_sensors
             if two_way and peer < self.settings.robot:
                 self.counters["pair.not_owner"] += 1
+                if isinstance(self.filter, NamingAnonymous):
+                    self.filter.unowned(t_ns, peer, told(found))
             else:
                 measurements.append(told(found))
         if not measurements:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from agent.core import Agent
-from agent.effects import Alarm, Broadcast, Effect, Estimate, Persist, Publish, Send, Steer
+from agent.effects import Alarm, Broadcast, Effect, Estimate, Named, Persist, Publish, Send, Steer
 from agent.events import ClockJudged, Event, LinkChange, Received, Tick
 from agent.figures import NisSum
 from agent.sensor_input import SensorConfig, SensorError, decode
@@ -24,6 +24,8 @@ Recorder = Callable[[Event, list[Effect]], None]
 class Outgoing:
     """What a shell has to carry out: a state to keep first, then packets to send, and estimates to show.
 
+    `named` are measurements that came without a name and have one now.
+
     `steer` is the newest command to the vehicle, which replaces the one before.
     `persist` is the newest state, and `ahead` if a packet must not leave before one is kept that is as new.
     """
@@ -31,6 +33,7 @@ class Outgoing:
     packets: list[Packet] = field(default_factory=list)
     estimates: list[Estimate] = field(default_factory=list)
     alarms: list[Alarm] = field(default_factory=list)
+    named: list[Named] = field(default_factory=list)
     persist: Persist | None = None
     steer: Steer | None = None
     next_life: int | None = None
@@ -164,6 +167,8 @@ class Node:
                     out.estimates.append(estimate)
                 case Alarm():
                     out.alarms.append(effect)
+                case Named():
+                    out.named.append(effect)
                 case Steer():
                     out.steer = effect
                 case Persist(payload):

@@ -12,32 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.cooperative_filter import FilterMark
-from agent.effects import Broadcast, Effect, Estimate
+from agent.effects import Effect, Estimate
 from agent.estimation.gate_test import GateTest
-from agent.estimation.mounting import rotation
+from agent.estimation.mounting import in_body
 from agent.estimation.observation import AbsoluteModel, RelativeModel
-from agent.estimation.reckoning import extended
 from agent.events import LEVEL, LinkChange, Observation, Received
 from agent.fixed_filter import FAR_FUTURE_NS, FixedFilter
 from agent.pair_clock import PairClocks
-from agent.peer_motion import Stretch
 from agent.peer_tables import remember
-from agent.relative_leader import Altitude, Leader, body_motion, heard
+from agent.relative_leader import Leader, Sight
+from agent.relative_reports import MotionTeller, altitude_of, identified, take_report
 from agent.saved_state import SavedSplit
 from agent.settings import AgentSettings
-from network.messages import Body, Channel, Epoch, Measurement
-from network.relative_messages import Height, HypothesesReport, MotionReport
+from network.messages import Body, Epoch, Measurement
+from network.relative_messages import HypothesesReport, MotionReport
 
 Array = NDArray[np.float64]
-
-TELL_NS = 40_000_000
-"""Motions are told in stretches of at least that, which is each step of an odometry of 20 Hz."""
-
-MAX_TOLD_NS = 5_000_000_000
-"""Of a longer stretch nothing is told: it was coasted over."""
-
-AMBIGUOUS = 0.2
-"""A second hypothesis as probable as that is made known to people."""
 
 
 class RelativeFilter:
@@ -61,9 +51,7 @@ class RelativeFilter:
         self._leader: Leader | None = None
         if settings.relative.leads:
             self._leader = Leader(settings, self._own.t_ns, counters)
-        self._told_ns = self._own.t_ns
-        self._untold: list[tuple[int, Array, Array]] = []
-        self._altitude: Altitude | None = None
+        self._teller = MotionTeller(settings, self._own.t_ns, counters)
         self._revision = object()
         self._of: tuple[object, object] = (None, None)
         self._estimate: Estimate | None = None
@@ -97,13 +85,7 @@ class RelativeFilter:
         kind = "known" if relative.known else relative.correspondence.kind
         if self._leader is None:
             return f"relative, {kind}", "no camera: it tells how it moves"
-        found = self.estimate().relatives
-        unsure = "".join(
-            f"; {item.peer} ambiguous ({item.ambiguity:.2f})" for item in found if item.ambiguity >= AMBIGUOUS
-        )
-        unsure += "".join(f"; {peer} not heard" for peer in self._leader.unheard())
-        confirmed = sum(item.confirmed for item in found)
-        return f"relative, {kind}", f"{confirmed} of {len(relative.peers)} identified{unsure}"
+        return f"relative, {kind}", identified(self._leader, len(relative.peers))
 
     def contacts(self) -> dict[str, Epoch]:
         """There are no contacts of pairs."""
@@ -124,7 +106,7 @@ class RelativeFilter:
     def advance(self, t_ns: int, delta: Array, cov: Array) -> None:
         t0_ns = self._own.t_ns
         self._own.advance(t_ns, delta, cov)
-        self._untold.append((t_ns, delta, cov))
+        self._teller.moved(t_ns, delta, cov)
         if self._leader is not None:
             self._leader.moved(t0_ns, t_ns, delta, cov)
 
@@ -138,13 +120,10 @@ class RelativeFilter:
         landmark: str | None = None,
     ) -> None:
         self._own.absolute(t_ns, kind, model, z, R, landmark)
-        up = self._settings.layout.altitude
-        if not isinstance(model, AbsoluteModel) or up is None or up not in model.components:
+        altitude = altitude_of(t_ns, self._settings.layout, model, z, R)
+        if altitude is None:
             return
-        row = list(model.components).index(up)
-        altitude = Altitude(t_ns, float(z[row]), float(R[row, row]))
-        if self._altitude is None or altitude.t_ns > self._altitude.t_ns:
-            self._altitude = altitude
+        self._teller.risen(altitude)
         if self._leader is not None:
             self._leader.altitude(self._settings.robot, altitude)
 
@@ -158,7 +137,8 @@ class RelativeFilter:
         elif self._settings.relative.known:
             self._counters["relative.no_identity"] += 1
         else:
-            self._saw(self._leader, t_ns, event, event.attitude, None)
+            direction = in_body(event.z, event.mount, event.attitude)
+            self._leader.saw(t_ns, Sight(direction, event.R, None))
 
     def measured(
         self, peer: str, t_ns: int, now_ns: int, measurements: tuple[Measurement, ...], effects: list[Effect]
@@ -169,53 +149,18 @@ class RelativeFilter:
                 self._leader.ranged(t_ns, peer, float(item.z[0]), float(item.R[0, 0]))
             elif self._leader is not None and item.kind == "bearing3":
                 of = peer if self._settings.relative.known else None
-                self._saw(self._leader, t_ns, item, LEVEL, of)
+                self._leader.saw(t_ns, Sight(in_body(item.z, item.mount, LEVEL), item.R, of))
             else:
                 self._counters["relative.unused"] += 1
-
-    @staticmethod
-    def _saw(
-        leader: Leader,
-        t_ns: int,
-        found: Observation | Measurement,
-        attitude: tuple[float, float],
-        of: str | None,
-    ) -> None:
-        """`attitude`: roll and pitch of the body; a measurement for a peer is as if it were level."""
-        _, _, _, *turns = found.mount
-        z = found.z
-        if any(turns) or attitude != LEVEL:
-            (cos_az, cos_el), (sin_az, sin_el) = np.cos(z), np.sin(z)
-            ray = np.array([cos_el * cos_az, cos_el * sin_az, sin_el])
-            x, y, up = rotation(*attitude, 0.0) @ rotation(*turns) @ ray
-            z = np.array([np.arctan2(y, x), np.arctan2(up, np.hypot(x, y))])
-        leader.saw(t_ns, z, found.R, of)
 
     # -- peers ----------------------------------------------------------------------------------------------
 
     def heard(self, event: Received, effects: list[Effect]) -> None:
-        header, body = event.message.header, event.message.body
-        leader = self._leader
-        if not isinstance(body, MotionReport | HypothesesReport):
+        if not isinstance(event.message.body, MotionReport | HypothesesReport):
             self._counters["received.unused"] += 1
-            return
-        if leader is None:
-            return
-        if not leader.knows(header.source):
-            self._counters["motion.stranger" if isinstance(body, MotionReport) else "hypotheses.stranger"] += 1
-            return
-        t_ns = header.t_meas_ns - self._clocks.offset_ns(event)
-        if t_ns > event.t_ns + self._settings.round.period_ns:
-            self._counters["round.future"] += 1
-        elif isinstance(body, HypothesesReport):
-            leader.told.hear(header.source, header.t_meas_ns, t_ns, body.part, body.parts, heard(body))
-        else:
-            height = body.height
-            altitude = None
-            if height is not None:
-                altitude = Altitude(t_ns - height.age_ns, height.altitude_m, height.variance_m2)
-            stretch = Stretch(t_ns - body.span_ns, t_ns, body.velocity, body.cov)
-            leader.heard_motion(header.source, stretch, altitude)
+        elif self._leader is not None:
+            t_ns = event.message.header.t_meas_ns - self._clocks.offset_ns(event)
+            take_report(self._leader, event, t_ns, self._settings, self._counters)
 
     def link_changed(self, event: LinkChange) -> None:
         life = event.incarnation, event.boot_id
@@ -227,43 +172,17 @@ class RelativeFilter:
             self._leader.reborn(event.peer)
 
     def settled(self, until_ns: int, effects: list[Effect]) -> None:
-        self._tell(until_ns, effects)
+        self._teller.tell(until_ns, effects)
         if self._leader is not None:
             self._leader.settled(until_ns)
-
-    def _tell(self, until_ns: int, effects: list[Effect]) -> None:
-        """How the robot has moved up to an instant all data of which are in."""
-        total, total_cov, used = np.zeros(4), np.zeros((4, 4)), 0
-        for index, (t_ns, delta, cov) in enumerate(self._untold):
-            if t_ns > until_ns:
-                break
-            total, total_cov = extended(total, total_cov, delta, cov) if index > used else (delta, cov)
-            if t_ns - self._told_ns >= TELL_NS:
-                self._tell_stretch(t_ns, total, total_cov, effects)
-                used = index + 1
-        del self._untold[:used]
-
-    def _tell_stretch(self, t_ns: int, delta: Array, cov: Array, effects: list[Effect]) -> None:
-        span_ns, self._told_ns = t_ns - self._told_ns, t_ns
-        if span_ns > MAX_TOLD_NS:
-            self._counters["motion.untold"] += 1
-            return
-        height, altitude = None, self._altitude
-        if altitude is not None and t_ns - span_ns < altitude.t_ns <= t_ns:
-            height = Height(altitude.value, altitude.variance, t_ns - altitude.t_ns)
-        motion = body_motion(span_ns, delta, cov)
-        effects.append(Broadcast(Channel.BELIEF, t_ns, MotionReport(span_ns, motion.velocity, motion.cov, height)))
 
     def expire(self, now_ns: int, effects: list[Effect]) -> None:
         if self._leader is not None:
             self._leader.act(now_ns, effects)
 
     def deadline_ns(self) -> int:
-        deadline = FAR_FUTURE_NS if self._leader is None else self._leader.deadline_ns(FAR_FUTURE_NS)
-        for t_ns, _, _ in self._untold:
-            if t_ns - self._told_ns >= TELL_NS:
-                return min(deadline, t_ns + self._settings.lateness.settle_ns)
-        return deadline
+        leader_ns = FAR_FUTURE_NS if self._leader is None else self._leader.deadline_ns(FAR_FUTURE_NS)
+        return min(leader_ns, self._teller.deadline_ns(FAR_FUTURE_NS))
 
     def instant_ns(self, event: Received) -> int:
         return self._own.instant_ns(event)

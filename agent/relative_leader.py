@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from agent.effects import Broadcast, Effect, RelativeEstimate
 from agent.estimation.correspondence import BodyMotion, Correspondence, Hypotheses, Scan, carry
 from agent.estimation.motion import split_increment
+from agent.events import Observation
 from agent.peer_motion import LEAST_VARIANCE, PeerMotion, Stretch
 from agent.rounds import RoundClock
 from agent.settings import NS, AgentSettings
 from agent.told_hypotheses import ToldHypotheses, sendable_part
 from network.messages import Channel
-from network.relative_messages import HypothesesReport
 from network.wire_relative import parted
 
 Array = NDArray[np.float64]
@@ -52,6 +52,17 @@ class Altitude:
     variance: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """A bearing: azimuth and elevation (2,) of the own body [rad], with R (2, 2); of whom, None: nobody knows; and the
+    observation it was made of, of one that may be given a name."""
+
+    direction: Array
+    R: Array
+    of: str | None
+    observation: Observation | None = None
+
+
 @dataclass(slots=True, eq=False)
 class _Step:
     """The own motion from t0_ns to t_ns, and what was sensed then."""
@@ -60,7 +71,7 @@ class _Step:
     t_ns: int
     delta: Array
     cov: Array
-    bearings: list[tuple[Array, Array, str | None]] = field(default_factory=list)
+    bearings: list[Sight] = field(default_factory=list)
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
@@ -105,6 +116,7 @@ class Leader:
         self._open_ns: int | None = None
         self._closes_ns = 0
         self._fused_ns = 0
+        self._named: list[tuple[str, Observation]] = []
         self.revision = object()
 
     def _motion(self, start_ns: int) -> PeerMotion:
@@ -133,11 +145,16 @@ class Leader:
         self._counters["relative.late"] += 1
         return None
 
-    def saw(self, t_ns: int, direction: Array, R: Array, of: str | None) -> None:
-        """The camera has seen a robot `of` (None: who knows) at azimuth and elevation (2,) of the own body."""
+    def saw(self, t_ns: int, sight: Sight) -> None:
+        """The camera has seen a robot."""
         step = self._at(t_ns)
         if step is not None:
-            step.bearings.append((direction, R, of))
+            step.bearings.append(sight)
+
+    def take_named(self) -> list[tuple[str, Observation]]:
+        """Bearings that have turned out to be of whom since this was asked last."""
+        found, self._named = self._named, []
+        return found
 
     def ranged(self, t_ns: int, peer: str, distance: float, variance: float) -> None:
         if peer not in self._motions:
@@ -226,14 +243,18 @@ class Leader:
     def _scan(self, step: _Step, own: BodyMotion, motions: Mapping[str, BodyMotion]) -> None:
         bearings, cov = NO_BEARINGS, np.eye(2)
         if step.bearings:
-            bearings = np.array([found for found, _, _ in step.bearings])
-            cov = np.mean([R for _, R, _ in step.bearings], axis=0)
+            bearings = np.array([sight.direction for sight in step.bearings])
+            cov = np.mean([sight.R for sight in step.bearings], axis=0)
         labels = None
         if self._settings.relative.known:
-            labels = {of: index for index, (_, _, of) in enumerate(step.bearings) if of in self._motions}
+            labels = {sight.of: row for row, sight in enumerate(step.bearings) if sight.of in self._motions}
             self._counters["relative.stranger"] += len(step.bearings) - len(labels)
         heights = self._heights(step, own, motions)
-        self.correspondence.scan(Scan(bearings, cov, step.ranges, heights), labels)
+        found = self.correspondence.scan(Scan(bearings, cov, step.ranges, heights), labels)
+        for peer, row in found.items():
+            observation = step.bearings[row].observation
+            if observation is not None:
+                self._named.append((peer, observation))
         self._counters["relative.scans"] += 1
 
     def _heights(
@@ -354,22 +375,6 @@ class Leader:
                     )
                 )
         return tuple(found)
-
-
-def heard(report: HypothesesReport) -> dict[str, Hypotheses]:
-    """What a report says of each robot."""
-    return {
-        item.subject: Hypotheses(
-            item.weights,
-            item.means,
-            item.covs,
-            item.priors,
-            item.prior_covs,
-            None if item.priors is None else np.array(item.prior_known, dtype=bool),
-        )
-        for item in report.subjects
-        if len(item.weights)
-    }
 
 
 def _of_part(motion: BodyMotion, share: float) -> BodyMotion:

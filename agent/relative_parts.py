@@ -23,10 +23,11 @@ Probability = Annotated[float, Field(gt=0.0, lt=1.0, allow_inf_nan=False)]
 
 
 class CorrespondencePart(Part):
-    """How robots of `localization.kind = "relative"` are told apart.
+    """How robots of `localization.kind = "relative"`, or "clat" with cameras that do not tell whom they see, are told
+    apart.
 
     kind       `known`: cameras say whom they see; `gaussian_sum`: a sum of hypotheses per robot (De Silva, Mann and
-               Gosine 2015); `nearest`: the nearest bearing is believed, a baseline
+               Gosine 2015); `nearest`, of "relative": the nearest bearing is believed, a baseline
     form       of the sum: `improved`, or as `published`
     detection  probability that a camera sees a robot that is in view, and that a range is measured
     clutter    expected false bearings of one scan
@@ -63,21 +64,38 @@ class CorrespondencePart(Part):
             turn_acceleration_radps2=self.turn_acceleration_radps2,
         )
 
+    def names(self, localization: LocalizationPart) -> bool:
+        """Whether a robot of the kind `clat` finds out whom its camera sees."""
+        return localization.kind == "clat" and self.kind == "gaussian_sum"
+
+    def _refuse(self, localization: LocalizationPart) -> None:
+        """Raises `ConfigError` for a key that another kind of localization has no use for."""
+        for key, field in CorrespondencePart.model_fields.items():
+            stated = getattr(self, key)
+            if stated == field.default:
+                continue
+            remedy = "set that, or leave it out"
+            if localization.kind == "clat":
+                remedy = "set that, or correspondence.kind = 'gaussian_sum', or leave it out"
+            raise ConfigError(
+                f"correspondence.{key} = {stated!r} needs localization.kind = 'relative', not "
+                f"'{localization.kind}'; {remedy}"
+            )
+
     def check(self, localization: LocalizationPart, model: str) -> None:
         """Raises `ConfigError` if the kind of localization has no use for it, or the robot's model is a planar one."""
-        if localization.kind != "relative":
-            for key, field in CorrespondencePart.model_fields.items():
-                stated = getattr(self, key)
-                if stated != field.default:
-                    raise ConfigError(
-                        f"correspondence.{key} = {stated!r} needs localization.kind = 'relative', not "
-                        f"'{localization.kind}'; set that, or leave it out"
-                    )
+        if localization.kind != "relative" and not self.names(localization):
+            self._refuse(localization)
             return
+        what = "localization.kind = 'relative'" if localization.kind == "relative" else "correspondence.kind"
         if LAYOUTS[model].altitude is None:
             raise ConfigError(
-                f"localization.kind = 'relative' locates robots in space, and the model '{model}' is planar; take "
-                "'planar_altitude'"
+                f"{what} locates robots in space, and the model '{model}' is planar; take 'planar_altitude'"
+            )
+        if localization.kind == "clat" and self.form != "improved":
+            raise ConfigError(
+                f"correspondence.form = '{self.form}' weighs nothing against false bearings, so that no name is beyond "
+                "doubt; with localization.kind = 'clat' leave it out"
             )
         if self.kind == "known" and self.clutter != CorrespondencePart().clutter:
             raise ConfigError(
@@ -95,16 +113,17 @@ class AgentCorrespondencePart(CorrespondencePart):
 
     def check_peers(self, robot: str, localization: LocalizationPart) -> None:
         """Raises `ConfigError` if nobody, somebody twice or the robot itself is to be located."""
-        if localization.kind != "relative":
+        relative = localization.kind == "relative"
+        if not relative and not self.names(localization):
             if self.peers:
                 raise ConfigError(
-                    "correspondence.peers needs localization.kind = 'relative'; set that, or leave it out"
+                    "correspondence.peers needs localization.kind = 'relative', or 'clat' with correspondence.kind = "
+                    "'gaussian_sum'; set that, or leave it out"
                 )
             return
         if not self.peers:
-            raise ConfigError(
-                "correspondence.peers is missing: localization.kind = 'relative' needs the ids of all other robots"
-            )
+            needs = "localization.kind = 'relative'" if relative else "correspondence.kind = 'gaussian_sum'"
+            raise ConfigError(f"correspondence.peers is missing: {needs} needs the ids of all other robots")
         if robot in self.peers:
             raise ConfigError(f"correspondence.peers names {robot}, which is this robot itself; list the others only")
         twice = next((name for name in self.peers if self.peers.count(name) > 1), None)
@@ -112,13 +131,14 @@ class AgentCorrespondencePart(CorrespondencePart):
             raise ConfigError(f"correspondence.peers names {twice} twice; ids must differ")
 
 
-def check_leader(kinds: Mapping[str, str]) -> None:
-    """Raises `ConfigError` if a robot with a camera lacks what goes with it: `kinds` of sensors by name."""
+def check_leader(kinds: Mapping[str, str], what: str = "localization.kind = 'relative'") -> None:
+    """Raises `ConfigError` if a robot with a camera lacks what goes with it: `kinds` of sensors by name; `what` asks
+    for it."""
     found = {*kinds.values()}
     if found.intersection(CAMERAS) and "range" not in found:
         raise ConfigError(
-            "localization.kind = 'relative': a robot with a camera (bearing3) needs a range to each of the others, "
-            "which alone has a name; add a sensor of kind 'range'"
+            f"{what}: a robot with a camera (bearing3) needs a range to each of the others, which alone has a name; "
+            "add a sensor of kind 'range'"
         )
 
 

@@ -82,7 +82,8 @@ def agent_tables(scenario: Scenario, world: World, robot: RobotPart) -> dict[str
 def correspondence_table(scenario: Scenario, robot: RobotPart) -> dict[str, Any]:
     """How a robot tells the others apart, and who they are."""
     found = table(scenario.correspondence_of(robot))
-    if scenario.localization_of(robot).kind == "relative":
+    localization = scenario.localization_of(robot)
+    if localization.kind == "relative" or scenario.correspondence_of(robot).names(localization):
         found["peers"] = [other.id for other in scenario.robots if other.id != robot.id]
     return found
 

@@ -31,6 +31,7 @@ from sim.engine_faults import ClockChange, EngineFaults, Forged, Happening, Intr
 from sim.fault_plan import trial_faults
 from sim.faulty_world import FaultyWorld
 from sim.invariants import InvariantChecker
+from sim.label_figures import LabelLog
 from sim.lives import LifeSink, Process
 from sim.metrics import TrialTrace
 from sim.motion_figures import trial_motion
@@ -125,6 +126,7 @@ class VirtualEngine:
         self._bound = bound_of(scenario, world) if with_bound else None
         self.contacts: list[tuple[float, str, str]] = []
         self._measured = MeasurementLog()
+        self._labels = LabelLog()
         self._applied: dict[str, int] = {}
         self._bases: dict[tuple[str, str], Epoch] = {}
         self._traffic: Counter[str] = Counter()
@@ -163,6 +165,7 @@ class VirtualEngine:
             self._pass(self._k * self._world.step_ns - 1)
         outputs = self._world.outputs(self._k)
         self._measured.add(outputs)
+        self._labels.add(outputs)
         for item in outputs:
             self._push(item.t_ns + item.late_ns, int(item.phase), item.robot, item)
         self._play(self._k)
@@ -305,6 +308,8 @@ class VirtualEngine:
             self._checker.after(node, self._now, event, out)
         if out.persist is not None:
             self._processes[node.robot].keep(out.persist)
+        for named in out.named:
+            self._labels.judge(node.robot, named)
         for packet in out.packets:
             self._transmit(packet)
         if out.next_life is not None:
@@ -384,7 +389,7 @@ class VirtualEngine:
         counters = {name: process.counters() for name, process in self._processes.items()}
         measured = self._measured.instants()
         return TrialResult(
-            self._sampler.trace(),
+            replace(self._sampler.trace(), labels=self._labels.figures()),
             self.contacts,
             network_figures(self._traffic, counters),
             dict(sorted(refused.items())),

@@ -30,6 +30,7 @@ from agent.effects import Estimate
 from agent.estimation.gaussian import is_positive_definite
 from agent.estimation.motion import UNICYCLE_GAINS
 from agent.factor_filter import FactorFilter
+from agent.naming_filter import NamingFilter
 from agent.node import Node, Outgoing
 from agent.replica_filter import ReplicaFilter
 from agent.split_filter import SplitFilter
@@ -167,10 +168,16 @@ def _unlearnt(life: _Life, estimate: Estimate) -> Iterable[tuple[str, str]]:
     life.learnt, life.volume, life.form = learnt, volume, form
 
 
-def _split(node: Node) -> Iterable[tuple[str, str]]:
+def _active(node: Node) -> Any:
+    """The filter that localizes, of the form that is on."""
     active: Any = node.agent.filter
-    if isinstance(active, AutoFilter):
-        active = active.active
+    if isinstance(active, NamingFilter):
+        active = active.own
+    return active.active if isinstance(active, AutoFilter) else active
+
+
+def _split(node: Node) -> Iterable[tuple[str, str]]:
+    active = _active(node)
     if not isinstance(active, SplitFilter):
         return
     split = active.state.split
@@ -199,9 +206,7 @@ def _bounds(node: Node) -> Iterable[tuple[str, str]]:
 
 
 def _contacts(life: _Life) -> Iterable[tuple[str, str]]:
-    active: Any = life.node.agent.filter
-    if isinstance(active, AutoFilter):
-        active = active.active
+    active = _active(life.node)
     newest = active.contacts()
     if isinstance(active, ReplicaFilter):
         # It is told raw data, also late ones, and keeps each once; nothing is a contact.

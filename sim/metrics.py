@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian import is_positive_definite, quadratic_form, wrap
+from sim.label_figures import combine_labels
 from sim.relative_figures import Pair, RelativeTrace, combine_relatives, reduce_relatives, trial_row
 
 Array = NDArray[np.float64]
@@ -45,7 +46,7 @@ class TrialTrace:
     """Samples of one trial. `targets` is by target, then by the robot that tracks it.
 
     `bound`, if given, is {"robots": {id: StateTrace}, "targets": {id: StateTrace}}. `relatives`: what a robot made of
-    another one, by both.
+    another one, by both; `labels`: how often robots were right about whom a camera saw that does not tell.
     """
 
     t_s: Array
@@ -53,6 +54,7 @@ class TrialTrace:
     targets: dict[str, dict[str, StateTrace]]
     bound: dict[str, dict[str, StateTrace]] | None = None
     relatives: dict[Pair, RelativeTrace] = field(default_factory=dict)
+    labels: dict[str, int] | None = None
 
 
 def components(trace: StateTrace) -> list[str]:
@@ -187,6 +189,8 @@ def reduce_trial(
     relative = reduce_relatives(trace.t_s, trace.relatives, inside)
     if relative is not None:
         reduced["relative"] = relative
+        if trace.labels is not None:
+            relative["labels"] = trace.labels
     for target, owners in trace.targets.items() if measured is not None else ():
         seen = {robot: times for (robot, of), times in (measured or {}).items() if of == f"target:{target}"}
         for robot, track in owners.items():
@@ -361,7 +365,10 @@ def combine(trials: Sequence[dict[str, Any]], lost_above_m: float) -> dict[str, 
             "targets": {name: _entity([bound["targets"][name] for bound in kept], False) for name in first["targets"]},
         }
     if "relative" in first:
-        summary["relative"] = combine_relatives([trial["relative"] for trial in trials])
+        summary["relative"] = combine_relatives([trial["relative"] for trial in trials if "relative" in trial])
+        labels = [trial["relative"]["labels"] for trial in trials if "labels" in trial.get("relative", {})]
+        if labels:
+            summary["relative"]["labels"] = combine_labels(labels)
     summary["series"] = _series(used)
     return summary
 

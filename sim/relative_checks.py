@@ -10,51 +10,66 @@ from sim.scenario import RobotPart, Scenario, SensorPart, sensor_kind
 
 
 def check_relative(scenario: Scenario) -> None:
-    """Raises `ConfigError` for a fleet of the kind `relative` that lacks something, and for keys only it uses."""
-    leaders = 0
+    """Raises `ConfigError` for a fleet that finds out who is who and lacks something, and for keys only it uses."""
+    leaders, fleet, naming = 0, [], []
     for robot in scenario.robots:
         where = f"{scenario.name}: robots.{robot.id}"
         localization, correspondence = scenario.localization_of(robot), scenario.correspondence_of(robot)
-        relative = localization.kind == "relative"
+        relative, names = localization.kind == "relative", correspondence.names(localization)
+        what = "localization.kind = 'relative'" if relative else "correspondence.kind = 'gaussian_sum'"
         cameras = {name: sensor for name, sensor in robot.sensors.items() if sensor_kind(name, sensor) in CAMERAS}
         for name, sensor in cameras.items():
             _check_camera(f"{where}.sensors.{name}", sensor)
         try:
             correspondence.check(localization, robot.model)
             _check_arc(scenario, robot)
+            kinds = {name: sensor_kind(name, sensor) for name, sensor in robot.sensors.items()}
             if relative:
-                kinds = {name: sensor_kind(name, sensor) for name, sensor in robot.sensors.items()}
                 check_altitude(kinds)
-                check_leader(kinds)
+            if relative or names:
+                check_leader(kinds, what)
         except ConfigError as error:
             raise ConfigError(f"{scenario.name}: robots.{robot.id}: {error}") from None
         for name, sensor in cameras.items():
-            if sensor.anonymous and (not relative or correspondence.kind == "known"):
-                remedy = (
-                    "take correspondence.kind = 'gaussian_sum'" if relative else "take localization.kind = 'relative'"
-                )
+            if sensor.anonymous:
+                _check_anonymous(f"{where}.sensors.{name}.anonymous", localization.kind, correspondence.kind)
+            if (relative or names) and any(mount_of(sensor.mount)[:3]):
                 raise ConfigError(
-                    f"{where}.sensors.{name}.anonymous: a camera that does not tell whom it sees is of no use to "
-                    f"{'correspondence.kind = ' if relative else 'localization.kind = '}"
-                    f"'{correspondence.kind if relative else localization.kind}'; {remedy}, or leave it out"
+                    f"{where}.sensors.{name}.mount: {what} takes a camera to sit at the body's origin; state angles "
+                    "only"
                 )
-            if relative and any(mount_of(sensor.mount)[:3]):
-                raise ConfigError(
-                    f"{where}.sensors.{name}.mount: localization.kind = 'relative' takes a camera to sit at the body's "
-                    "origin; state angles only"
-                )
-        leaders += relative and bool(cameras)
-    fleet = [robot for robot in scenario.robots if scenario.localization_of(robot).kind == "relative"]
+        fleet += [robot.id] * (relative or names)
+        naming += [names] * (localization.kind == "clat")
+        leaders += (relative or names) and bool(cameras)
+    if any(naming) and not all(naming):
+        raise ConfigError(
+            f"{scenario.name}: correspondence.kind is 'gaussian_sum' for some robots of localization.kind = 'clat' "
+            "only: who does not tell how it moves is nowhere for the cameras of the others; give all robots one kind"
+        )
+    what = "correspondence.kind = 'gaussian_sum'" if any(naming) else "localization.kind = 'relative'"
     if fleet and not leaders:
         raise ConfigError(
-            f"{scenario.name}: localization.kind = 'relative' needs a robot with a camera; give one a sensor of kind "
-            "'bearing3' of peers, and a 'range'"
+            f"{scenario.name}: {what} needs a robot with a camera; give one a sensor of kind 'bearing3' of peers, and "
+            "a 'range'"
         )
     if len(fleet) > MAX_RELATIVE + 1:
         raise ConfigError(
-            f"{scenario.name}: localization.kind = 'relative' takes {MAX_RELATIVE + 1} robots at most, there are "
-            f"{len(fleet)}; take fewer"
+            f"{scenario.name}: {what} takes {MAX_RELATIVE + 1} robots at most, there are {len(fleet)}; take fewer"
         )
+
+
+def _check_anonymous(where: str, localization: str, correspondence: str) -> None:
+    """A camera that does not tell whom it sees is of use to those who find out. Robots of the kind `clat` may be told
+    in a simulated world, to compare."""
+    if localization == "clat" or (localization == "relative" and correspondence != "known"):
+        return
+    relative = localization == "relative"
+    key, value = ("correspondence.kind", correspondence) if relative else ("localization.kind", localization)
+    remedy = "correspondence.kind = 'gaussian_sum'" if relative else "localization.kind = 'relative'"
+    raise ConfigError(
+        f"{where}: a camera that does not tell whom it sees is of no use to {key} = '{value}'; take {remedy}, or leave "
+        "it out"
+    )
 
 
 def _check_camera(where: str, sensor: SensorPart) -> None:

@@ -126,7 +126,8 @@ class SensorPart(Part):
     forward axis. Simulated ranges are too long by `bias_m`, or by what `bias_of` says of the subject. Directions
     (`bearing3`) err by `noise`, see `sim.directions`. Who could be seen is detected with the probability `detects`; the
     share `false_share` of detections is of a direction drawn evenly. A camera that is `anonymous` does not tell whom it
-    sees, and sees `clutter` others per scan where nobody is. With a `gimbal` the field of view is a cone about
+    sees (it does to robots of `correspondence.kind = "known"`, with the same noise), and sees `clutter` others per scan
+    where nobody is. With a `gimbal` the field of view is a cone about
     where the camera saw a target last, see `sim.gimbal`. A recorded camera has the mount and intrinsics of the
     recording. The error of absolute information lasts for `correlation_s` (first-order; 0: each is a new one).
     """

@@ -38,7 +38,7 @@ class Output:
     """One sensor datum at `t_ns` since the start; odometry covers [t0_ns, t_ns].
 
     `attitude` is the roll and pitch [rad] the robot tells with it; None: level. It reaches the robot `late_ns` after
-    `t_ns`.
+    `t_ns`. `truly`: whom a camera has seen that does not tell, which nobody is told; "" of nobody.
     """
 
     t_ns: int
@@ -52,6 +52,7 @@ class Output:
     t0_ns: int | None = None
     attitude: tuple[float, float] | None = None
     late_ns: int = 0
+    truly: str | None = None
 
 
 class World(Protocol):
@@ -183,6 +184,7 @@ class SimulatedWorld:
             for name, sensor in robot.sensors.items()
             if sensor.clutter > 0.0
         }
+        self._labelled = {robot.id for robot in scenario.robots if scenario.correspondence_of(robot).kind == "known"}
         self._gimbals = {
             (robot.id, name): Gimbal(sensor.fov_rad or 2.0 * np.pi, self._heading(robot.id, 0))
             for robot in scenario.robots
@@ -339,13 +341,14 @@ class SimulatedWorld:
             wrap_components(z, model.angles)
             if kind in ("range", "range_bearing"):
                 z[0] = max(z[0] + sensor.bias_of.get(of, sensor.bias_m), 0.0)
-            told = None if sensor.anonymous else of
-            outputs.append(Output(t_ns, phase_of(of), robot.id, name, kind, told, z, R, attitude=attitude))
+            secret = sensor.anonymous and robot.id not in self._labelled
+            told, truly = (None, of) if secret else (of, None)
+            outputs.append(Output(t_ns, phase_of(of), robot.id, name, kind, told, z, R, attitude=attitude, truly=truly))
         if (robot.id, name) in self._clutter:
             for z in self._clutter[robot.id, name].at(k, sensor.fov_rad):
                 R = direction_covariance(sensor.noise, z, sensor.sigma_rad or 0.0)
                 R = R if sensor.noise in DRAWS else relative_noise(kind, sensor, 0.0)
-                outputs.append(Output(t_ns, Phase.PAIR, robot.id, name, kind, None, z, R, attitude=attitude))
+                outputs.append(Output(t_ns, Phase.PAIR, robot.id, name, kind, None, z, R, attitude=attitude, truly=""))
         if sensor.anonymous:
             # Nothing of the order in which robots are listed may tell who they are.
             outputs.sort(key=lambda item: float(item.z[0]))

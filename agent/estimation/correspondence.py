@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation import nearest_track
+from agent.estimation.bearing_labels import certain_labels
 from agent.estimation.gate_test import GateTest, gate_test
-from agent.estimation.gaussian_sum import Rules, Seen, Tracks, joined, moved, no_tracks, scanned
+from agent.estimation.gaussian_sum import Rules, Seen, Tracks, joined, moved, named_numbers, no_tracks, sighted
 from agent.estimation.gaussian_sum_doubt import distinct
 from agent.estimation.gaussian_sum_fusion import TOLD, Fusion, Told, fused, seen_back, seen_through
 from agent.estimation.gaussian_sum_pruning import pruned
@@ -34,6 +35,9 @@ OUTWEIGHED = 2.0
 
 CONFIRMED, CONFIRMED_RAD, CONFIRMED_S = 0.95, 0.3, 2.0
 """A robot is confirmed whose hypothesis has weighed so much, with a heading of this deviation, for so long."""
+
+DOUBTED = 0.5
+"""Bearings of a robot that was confirmed are given its name until its best hypothesis weighs less than that."""
 
 LEAST_CLUTTER = 0.1
 """False bearings per scan that are expected even of a sensor that is said to have none."""
@@ -152,6 +156,7 @@ class Correspondence:
         self._name = 1
         self._believed = np.zeros(len(self.peers), dtype=np.int64)
         self._sure_s = np.zeros(len(self.peers))
+        self._found = np.zeros(len(self.peers), dtype=np.bool_)
         self._bad = np.zeros(len(self.peers), dtype=np.int64)
         self._snapshot: Tracks | None = None
         self._tested: tuple[Tracks, Seen] | None = None
@@ -172,20 +177,27 @@ class Correspondence:
         self._snapshot = None
         self._sure_s = np.where(np.bincount(self._tracks.of, minlength=len(self.peers)) > 0, self._sure_s + dt_s, 0.0)
 
-    def scan(self, scan: Scan, labels: Mapping[str, int] | None = None) -> None:
+    def scan(self, scan: Scan, labels: Mapping[str, int] | None = None) -> dict[str, int]:
         """Direct fusion of one scan; peers that have neither a range nor a height in it are untouched.
 
-        labels: where identities are known, peer -> index into the bearings; a missing peer was not seen.
+        labels: where identities are known, peer -> index into the bearings; a missing peer was not seen. Returns which
+        bearing is beyond doubt that of whom, in the same way, by what was believed before the bearings.
         """
+        found: dict[str, int] = {}
         seen = self._seen(scan, labels)
         self._tested = self._tracks, seen
         if self.settings.kind == "nearest":
             self._tracks, self._bad = nearest_track.scanned(self._tracks, self._bad, seen, self._rules)
         else:
-            tracks, self._name = scanned(self._tracks, seen, self._rules, self._name)
+            tracks = named_numbers(self._tracks, seen, self._rules)
+            self._found |= self._sure_s >= CONFIRMED_S
+            named = certain_labels(tracks, seen, self._rules, self._found)
+            found = {self.peers[of]: row for of, row in named.items()}
+            tracks, self._name = sighted(tracks, seen, self._rules, self._name)
             self._tracks = pruned(tracks, self._rules, families=True)
         self._snapshot = None
         self._settle(self._tracks.lineage[:, -2])
+        return found
 
     def gate_test(self, peer: str) -> GateTest | None:
         """How the bearings of the last scan were judged for `peer`; None if there was nothing to judge."""
@@ -256,7 +268,7 @@ class Correspondence:
         for index in range(len(self.peers)):
             rows = np.flatnonzero(tracks.of == index)
             if not len(rows):
-                self._sure_s[index] = 0.0
+                self._sure_s[index], self._found[index] = 0.0, False
                 continue
             weight = tracks.weight[rows]
             best = int(weight.argmax())
@@ -267,6 +279,7 @@ class Correspondence:
             self._believed[index] = tracks.lineage[rows[best], -1]
             if weight[best] < CONFIRMED or tracks.cov[rows[best], 0, 3, 3] > CONFIRMED_RAD**2:
                 self._sure_s[index] = 0.0
+            self._found[index] &= weight[best] >= DOUBTED
 
     def _seen(self, scan: Scan, labels: Mapping[str, int] | None) -> Seen:
         n, m = len(self.peers), len(scan.bearings)

@@ -222,10 +222,14 @@ def gate_limit(probability: float, dof: int) -> float:
 
 def scanned(tracks: Tracks, seen: Seen, rules: Rules, name: int) -> tuple[Tracks, int]:
     """All tracks after one scan, not pruned, and the next free name, from the first free `name` on (direct fusion)."""
+    return sighted(named_numbers(tracks, seen, rules), seen, rules, name)
+
+
+def named_numbers(tracks: Tracks, seen: Seen, rules: Rules) -> Tracks:
+    """All tracks after the heights and ranges of one scan, of which it is known whose they are."""
     rest = tracks.rows(~seen.present[tracks.of])
     tracks = tracks.rows(seen.present[tracks.of])
-    count = len(tracks)
-    if count:
+    if len(tracks):
         tracks = replace(tracks, misfit=FADING * tracks.misfit)
         measured = height(tracks.mean[:, 0], tracks.cov[:, 0], seen.heights[tracks.of], seen.height_vars[tracks.of])
         tracks = numbered(tracks, measured, seen.with_height[tracks.of], rules)
@@ -233,9 +237,16 @@ def scanned(tracks: Tracks, seen: Seen, rules: Rules, name: int) -> tuple[Tracks
             tracks.mean[:, 0], tracks.cov[:, 0], seen.ranges[tracks.of], seen.range_vars[tracks.of], rules.improved
         )
         tracks = numbered(tracks, measured, seen.with_range[tracks.of], rules)
-    if not len(seen.bearings):
-        return _renamed(joined(rest, tracks), name)
+    return joined(rest, tracks)
 
+
+def sighted(tracks: Tracks, seen: Seen, rules: Rules, name: int) -> tuple[Tracks, int]:
+    """All tracks after the bearings of one scan whose numbers are in, and the next free name."""
+    if not len(seen.bearings):
+        return _renamed(tracks, name)
+    rest = tracks.rows(~seen.present[tracks.of])
+    tracks = tracks.rows(seen.present[tracks.of])
+    count = len(tracks)
     there = direction(tracks.mean[:, 0], tracks.cov[:, 0], seen.bearing_cov, not rules.improved)
     residual = residuals(there.expected, seen.bearings)
     d2, likely = squared(residual, there.gate)

@@ -58,6 +58,17 @@ def levelled(mount: Mount, attitude: tuple[float, float]) -> Mount:
     return (x, y, z, 0.0, pitch, math.atan2(-turn[0, 1], turn[1, 1]))
 
 
+def in_body(direction: Array, mount: Mount, attitude: tuple[float, float]) -> Array:
+    """Azimuth and elevation (2,) of a sensor, as seen along the axes of the level body; the lever arm is left out."""
+    _, _, _, *turns = mount
+    if not any(turns) and attitude == LEVEL:
+        return direction
+    (cos_az, cos_el), (sin_az, sin_el) = np.cos(direction), np.sin(direction)
+    ray = np.array([cos_el * cos_az, cos_el * sin_az, sin_el])
+    x, y, up = rotation(*attitude, 0.0) @ rotation(*turns) @ ray
+    return np.array([np.arctan2(y, x), np.arctan2(up, np.hypot(x, y))])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
     """A sensor on a levelled body: turn (d, d) into its axes, lever arm (d,) in them.

@@ -251,7 +251,7 @@ def test_a_tilted_camera_on_a_tilted_body_sees_the_same() -> None:
         leader = relative(agent)._leader
         assert leader is not None
         found: list[np.ndarray] = []
-        leader.saw = lambda t_ns, z, R, of, found=found: found.append(z)  # type: ignore[method-assign,assignment]
+        leader.saw = lambda t_ns, sight, found=found: found.append(sight.direction)  # type: ignore[method-assign,assignment]
         seen.append(found)
     z = np.array([0.4, 0.2])
     relative(level).anonymous(0, Observation(0, 0, "bearing3", None, z, np.eye(2)))

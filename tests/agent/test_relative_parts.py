@@ -31,6 +31,10 @@ def test_names_are_known_unless_said_otherwise() -> None:
         (CorrespondencePart(), RELATIVE, "unicycle", "planar_altitude"),
         (CorrespondencePart(clutter=3.0), RELATIVE, "planar_altitude", "gaussian_sum"),
         (CorrespondencePart(kind="nearest", form="published"), RELATIVE, "planar_altitude", "leave it out"),
+        (CorrespondencePart(kind="gaussian_sum"), LocalizationPart(), "unicycle", "planar_altitude"),
+        (CorrespondencePart(kind="gaussian_sum", form="published"), LocalizationPart(), "planar_altitude", "leave it"),
+        (CorrespondencePart(kind="gaussian_sum"), LocalizationPart(kind="jlatt"), "unicycle", "not 'jlatt'"),
+        (CorrespondencePart(clutter=3.0), LocalizationPart(), "planar_altitude", "or correspondence.kind"),
     ],
 )
 def test_what_does_not_go_together_is_refused_with_a_remedy(
@@ -53,6 +57,12 @@ def test_the_others_are_named_once(peers: list[str], kind: str, words: str) -> N
     part, localization = AgentCorrespondencePart(peers=peers), LocalizationPart(kind=kind)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=words):
         part.check_peers("l1", localization)
+
+
+def test_who_finds_out_names_needs_the_others() -> None:
+    with pytest.raises(ConfigError, match="'gaussian_sum' needs the ids"):
+        AgentCorrespondencePart(kind="gaussian_sum").check_peers("r1", LocalizationPart())
+    AgentCorrespondencePart(kind="gaussian_sum", peers=["r2"]).check_peers("r1", LocalizationPart())
 
 
 def test_a_camera_needs_ranges_and_everybody_an_altitude() -> None:
@@ -88,6 +98,31 @@ def test_a_camera_needs_ranges_and_everybody_an_altitude() -> None:
 def test_a_scenario_says_what_is_wrong_with_it(overrides: list[str], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         load("correspondence", overrides)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["robots.r2.correspondence.kind=known"], "give all robots one kind"),
+        (["correspondence.kind=nearest"], "needs localization.kind = 'relative'"),
+        (["correspondence.form=published"], "leave it out"),
+        (["correspondence.kind=known", "correspondence.clutter=2.0"], "correspondence.kind = 'gaussian_sum'"),
+        (["robots.r2.sensors.camera.mount=[0.1, 0, 0]"], "gaussian_sum' takes a camera to sit at the body's origin"),
+        (["robots.r2.sensors.range={kind=\"altitude\", of=[]}"], "gaussian_sum': a robot with a camera"),
+        (["localization.kind=replica", "correspondence.kind=known"], "is of no use to localization.kind = 'replica'"),
+    ],
+)
+def test_a_fleet_that_finds_out_names_says_what_is_wrong(overrides: list[str], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        load("anonymous-clat", overrides)
+
+
+def test_a_fleet_of_contacts_is_told_whom_to_tell_apart() -> None:
+    scenario = load("anonymous-clat", ["duration_s=1", "window_s=[0, 1]"])
+    settings = agent_config(scenario, open_world(scenario, 1), scenario.robots[0]).settings(0)
+    assert settings.relative.leads and settings.relative.peers == ("r2", "r3", "r4") and not settings.relative.known
+    named = load("anonymous-clat", ["duration_s=1", "window_s=[0, 1]", "correspondence.kind=known"])
+    assert agent_config(named, open_world(named, 1), named.robots[0]).settings(0).relative.peers == ()
 
 
 def test_each_robot_is_told_of_all_others() -> None:
