@@ -120,7 +120,7 @@ def test_a_vehicle_goes_as_its_agent_plans_and_stands_when_that_is_gone(tmp_path
     stored = load_trace(tmp_path / "run")
     assert stored is not None
     for robot, trace in stored.trace.robots.items():
-        ratio = nees(trace)[stored.trace.t_s >= 22.0]
+        ratio = nees(trace)[stored.trace.t_s >= 24.0]
         assert np.isfinite(ratio).all() and ratio.mean() <= 1.7, f"{robot} is overconfident: {ratio.mean():.2f}"
 
 
