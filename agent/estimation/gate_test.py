@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.gaussian_sum import Rules, Seen, Tracks, gate_limit, numbered
-from agent.estimation.relative_sights import direction, distance, height
+from agent.estimation.gaussian_sum import Rules, Seen, Tracks, gate_limit, named_numbers
+from agent.estimation.relative_sights import direction
 
 Array = NDArray[np.float64]
 
@@ -40,12 +40,6 @@ def gate_test(tracks: Tracks, seen: Seen, rules: Rules, index: int) -> GateTest 
     own = tracks.rows(tracks.of == index)
     if not len(own) or not len(seen.bearings):
         return None
-    if seen.present[index]:
-        measured = height(own.mean[:, 0], own.cov[:, 0], seen.heights[own.of], seen.height_vars[own.of])
-        own = numbered(own, measured, seen.with_height[own.of], rules)
-        measured = distance(
-            own.mean[:, 0], own.cov[:, 0], seen.ranges[own.of], seen.range_vars[own.of], rules.improved
-        )
-        own = numbered(own, measured, seen.with_range[own.of], rules)
+    own = named_numbers(own, seen, rules)
     there = direction(own.mean[:, 0], own.cov[:, 0], seen.bearing_cov, not rules.improved)
     return GateTest(seen.bearings, own.weight, there.expected, there.S, there.gate, gate_limit(rules.gate, 2))

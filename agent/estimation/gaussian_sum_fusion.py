@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation import relative_motion
-from agent.estimation.gaussian import wrap
+from agent.estimation.gaussian import symmetrize, wrap
 from agent.estimation.gaussian_sum import HEAVY, UNPROVEN, Rules, Tracks, gate_limit, joined, normalized
 from agent.estimation.gaussian_sum_pruning import pruned
 
@@ -113,19 +113,19 @@ def intersected(mean: Array, cov: Array, told: Told) -> tuple[Array, Array]:
     best = SHARES[np.argmax(np.linalg.slogdet(share * own + (1.0 - share) * other)[1], axis=0)][:, None, None]
     new = np.linalg.inv(best * own + (1.0 - best) * other)
     pull = (1.0 - best) * other @ _apart(told.mean[:, 0], mean)[..., None]
-    return _shifted(mean, (new @ pull)[..., 0]), _symmetric(new)
+    return _shifted(mean, (new @ pull)[..., 0]), symmetrize(new)
 
 
 def subtracted(mean: Array, cov: Array, told: Told) -> tuple[Array, Array]:
     """Beliefs (k, 4), (k, 4, 4) with as many told ones, less what those knew at the last fusion (eq. 10)."""
     own, other = np.linalg.inv(cov), np.linalg.inv(told.cov[:, 0])
     before = np.where(told.known[:, None, None], np.linalg.inv(told.cov[:, 1]), 0.0)
-    Y = _symmetric(own + other - before)
+    Y = symmetrize(own + other - before)
     sound = np.linalg.eigvalsh(Y)[:, 0] > 0.0
     new = np.linalg.inv(np.where(sound[:, None, None], Y, own))
     pull = other @ _apart(told.mean[:, 0], mean)[..., None] - before @ _apart(told.mean[:, 1], mean)[..., None]
     shift = np.where(sound[:, None], (new @ pull)[..., 0], 0.0)
-    return _shifted(mean, shift), np.where(sound[:, None, None], _symmetric(new), cov)
+    return _shifted(mean, shift), np.where(sound[:, None, None], symmetrize(new), cov)
 
 
 def _adopted(told: Told, of: int, rules: Rules, name: int, misfit: float) -> Tracks:
@@ -153,7 +153,3 @@ def _shifted(mean: Array, shift: Array) -> Array:
     found = mean + shift
     found[..., 3] = wrap(found[..., 3])
     return np.asarray(found)
-
-
-def _symmetric(matrix: Array) -> Array:
-    return np.asarray(0.5 * (matrix + matrix.swapaxes(-1, -2)))
