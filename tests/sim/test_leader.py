@@ -18,8 +18,10 @@ from sim.scenario_file import load
 from sim.trial import open_world, run_trial
 from tests.sizes import sized
 
-SEEDS = range(1, sized(3, 40) + 1)
+SEEDS = range(1, sized(8, 40) + 1)
 SECONDS = sized(10, 30)
+CHANCE = sized(1.6, 1.15)
+"""Of 60 seeds the mean is 1.04 with a deviation of 0.7 of each; eight of them are off by a quarter."""
 GAINS = "robots.r2.start_sigma={position_m=0.3, heading_rad=0.1, gain_along=0.1, gain_turn=0.1}"
 
 
@@ -58,7 +60,7 @@ def test_a_follower_is_honest_whatever_becomes_of_words(name: str, overrides: tu
     rmse_m, anees = follower(results)
     assert rmse_m < 0.25, (name, rmse_m)
     # Few trials: each of them tells about once.
-    assert 0.3 < anees < 2.3, (name, anees)
+    assert 0.3 < anees <= CHANCE, (name, anees)
     for result in results:
         assert result.counters["r2"]["used.leader"] > 8, name
         assert not result.counters["r2"].get("update.failed")
@@ -98,7 +100,7 @@ def test_a_leader_that_restarts_is_followed_again() -> None:
     for result in results:
         assert result.counters["r2"]["leader.new_life"] <= 1
         assert result.counters["r2"]["used.leader"] > 50
-    assert follower(results)[1] < 2.6
+    assert follower(results)[1] <= CHANCE, follower(results)
 
 
 @pytest.mark.parametrize("kind", ["replay", "compensate"])
