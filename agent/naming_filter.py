@@ -25,7 +25,7 @@ from agent.estimation.mounting import in_body
 from agent.estimation.observation import AbsoluteModel, RelativeModel, told
 from agent.events import LinkChange, Observation, Received
 from agent.pair_clock import PairClocks
-from agent.peer_tables import remember
+from agent.peer_tables import Lives
 from agent.relative_leader import Leader, Sight
 from agent.relative_reports import MotionTeller, altitude_of, identified, take_report
 from agent.saved_state import Saved
@@ -48,7 +48,7 @@ class NamingFilter:
         self.own = own
         self._settings, self._counters = settings, counters
         self._clocks = PairClocks(settings)
-        self._lives: dict[str, tuple[int, int]] = {}
+        self._lives = Lives()
         self._teller = MotionTeller(settings, own.t_ns, counters)
         self._leader = Leader(settings, own.t_ns, counters) if settings.relative.leads else None
         self._moved_ns = own.t_ns
@@ -192,12 +192,7 @@ class NamingFilter:
 
     def link_changed(self, event: LinkChange) -> None:
         self.own.link_changed(event)
-        life = event.incarnation, event.boot_id
-        if not event.up or self._lives.get(event.peer) == life:
-            return
-        known = event.peer in self._lives
-        remember(self._lives, event.peer, life)
-        if known and self._leader is not None:
+        if self._lives.begun(event) and self._leader is not None:
             self._leader.reborn(event.peer)
 
     def settled(self, until_ns: int, effects: list[Effect]) -> None:

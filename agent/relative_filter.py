@@ -19,7 +19,7 @@ from agent.estimation.observation import AbsoluteModel, RelativeModel
 from agent.events import LEVEL, LinkChange, Observation, Received
 from agent.fixed_filter import FAR_FUTURE_NS, FixedFilter
 from agent.pair_clock import PairClocks
-from agent.peer_tables import remember
+from agent.peer_tables import Lives
 from agent.relative_leader import Leader, Sight
 from agent.relative_reports import MotionTeller, altitude_of, identified, take_report
 from agent.saved_state import SavedSplit
@@ -35,19 +35,11 @@ class RelativeFilter:
 
     keeps_factors = False
 
-    def gate_tests(self) -> tuple[int, dict[str, GateTest]]:
-        """How the last scan's bearings were judged, by peer, and the instant it has been processed to (own clock)."""
-        if self._leader is None:
-            return self.t_ns, {}
-        judge = self._leader.correspondence
-        tests = {peer: test for peer in judge.peers if (test := judge.gate_test(peer)) is not None}
-        return self._leader.t_ns, tests
-
     def __init__(self, settings: AgentSettings, counters: Counter[str], saved: SavedSplit | None = None) -> None:
         self._settings, self._counters = settings, counters
         self._own = FixedFilter(settings, counters, saved)
         self._clocks = PairClocks(settings)
-        self._lives: dict[str, tuple[int, int]] = {}
+        self._lives = Lives()
         self._leader: Leader | None = None
         if settings.relative.leads:
             self._leader = Leader(settings, self._own.t_ns, counters)
@@ -55,6 +47,14 @@ class RelativeFilter:
         self._revision = object()
         self._of: tuple[object, object] = (None, None)
         self._estimate: Estimate | None = None
+
+    def gate_tests(self) -> tuple[int, dict[str, GateTest]]:
+        """How the last scan's bearings were judged, by peer, and the instant it has been processed to (own clock)."""
+        if self._leader is None:
+            return self.t_ns, {}
+        judge = self._leader.correspondence
+        tests = {peer: test for peer in judge.peers if (test := judge.gate_test(peer)) is not None}
+        return self._leader.t_ns, tests
 
     @property
     def t_ns(self) -> int:
@@ -163,12 +163,7 @@ class RelativeFilter:
             take_report(self._leader, event, t_ns, self._settings, self._counters)
 
     def link_changed(self, event: LinkChange) -> None:
-        life = event.incarnation, event.boot_id
-        if not event.up or self._lives.get(event.peer) == life:
-            return
-        known = event.peer in self._lives
-        remember(self._lives, event.peer, life)
-        if known and self._leader is not None:
+        if self._lives.begun(event) and self._leader is not None:
             self._leader.reborn(event.peer)
 
     def settled(self, until_ns: int, effects: list[Effect]) -> None:

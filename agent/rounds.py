@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from agent.events import LinkChange
-from agent.peer_tables import remember
+from agent.peer_tables import Lives, remember
 from agent.settings import RoundSettings
 from network.messages import RoundReport, RoundStage
 
@@ -40,7 +40,7 @@ class Reports(Generic[Report]):
         """`oldest_ns`: how old a report may be to be of use; None: `OLDEST_ROUNDS`."""
         self._settings = settings
         self._oldest_ns = OLDEST_ROUNDS * settings.period_ns if oldest_ns is None else oldest_ns
-        self._lives: dict[str, tuple[int, int]] = {}
+        self._lives = Lives()
         self._told: dict[str, Told[Report]] = {}
 
     def hear(self, told: Told[Report]) -> bool:
@@ -53,12 +53,10 @@ class Reports(Generic[Report]):
 
     def link_changed(self, event: LinkChange) -> bool:
         """Forget what a former life of a peer has told; whether there was one."""
-        life = event.incarnation, event.boot_id
-        if not event.up or self._lives.get(event.peer) == life:
-            return False
-        remember(self._lives, event.peer, life)
-        self._told.pop(event.peer, None)
-        return True
+        begun = self._lives.begun(event)
+        if begun is not None:
+            self._told.pop(event.peer, None)
+        return begun is not None
 
     def newest(self, t_ns: int) -> list[Told[Report]]:
         """What is not too old at `t_ns`, in ascending order of peers."""
